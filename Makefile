@@ -19,13 +19,13 @@ index_url   = $(lastword $(call pip_setting,index-url))
 uv_flags    = $(addprefix --default-index ,$(index_url)) \
               $(if $(TORCH_BACKEND),--torch-backend=$(TORCH_BACKEND),$(or $(addprefix --find-links ,$(find_links)),--torch-backend=cpu))
 
-.PHONY: help setup demo check pytest test docs bench clean
+.PHONY: help setup demo lint quick check pytest test docs bench clean
 
 help:
 	@echo "make demo    a short pre-training from scratch: about five minutes, ends with what Bob has learned"
-	@echo "make test    check and every test: about ten minutes, ends with how many passed"
+	@echo "make test    ruff, mypy and every test: about ten minutes, ends with how many passed"
 	@echo "make setup   make $(VENV) and install everything into it: about two minutes, 2.5 GB; the others do it first"
-	@echo "make check   ruff and mypy: about a minute"
+	@echo "make check   ruff, mypy and the tests that are not slow: a minute and a half"
 	@echo "make docs    the docs site, into build/docs-site/site"
 	@echo "make bench   the throughput benchmarks, against panda-gym"
 	@echo "make clean   remove $(VENV) and the caches; runs/ stays"
@@ -51,17 +51,27 @@ demo: $(STAMP)
 	$(VENV)/bin/tandem demo
 	@echo "  (tandem is $(VENV)/bin/tandem; after '. $(VENV)/bin/activate' it is just tandem)"
 
-check: $(STAMP)
+lint: $(STAMP)
 	$(PY) -m ruff check
 	$(PY) -m ruff format --check
 	$(PY) -m mypy
 
+# A file of tests stays in one process, so nothing that its tests share is made twice; tests/conftest.py puts the longest first.
+# Many tests start other processes, which would compile what they import each time where Python may not write bytecode.
+PYTEST = $(PY) -m compileall -q service && $(PY) -m pytest -n $(JOBS) --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+
+quick: $(STAMP)
+	$(PYTEST) -m "not slow"
+
 pytest: $(STAMP)
-	$(PY) -m pytest -n $(JOBS) --maxprocesses 8 --dist worksteal
+	$(PYTEST)
 
 # Both at once: mypy takes a core for half a minute.
+check: $(STAMP)
+	@$(MAKE) -j 2 --no-print-directory lint quick
+
 test: $(STAMP)
-	@$(MAKE) -j 2 --no-print-directory check pytest
+	@$(MAKE) -j 2 --no-print-directory lint pytest
 
 docs: $(STAMP)
 	$(PY) -m tools.docs_site

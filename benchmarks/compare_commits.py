@@ -2,7 +2,7 @@
 
     python -m benchmarks.compare_commits 10399f0 HEAD --json docs/results/throughput.json
     python -m benchmarks.compare_commits 2b220b3^ HEAD --worlds --json docs/results/world_speed.json
-    python -m benchmarks.compare_commits 4dacdca HEAD --task wall --seconds 20
+    python -m benchmarks.compare_commits f0b7427 HEAD --task wall --seconds 20
 
 Each commit is checked out into a worktree of its own and trains with its own shipped configuration for the same number
 of env steps, since policies that touch the object make its physics dearer. From there a number of iterations is
@@ -34,7 +34,6 @@ from benchmarks.measuring import (
     ROOT,
     Sample,
     describe_ratio,
-    parser_of,
     rates,
     rates_table,
     ratio,
@@ -53,7 +52,7 @@ from service.base.errors import TandemError
 from service.store.run_directory import RunDirectory
 
 PACKAGES = ("mujoco", "numpy", "torch")
-NUM_WORLDS = (8, 240)
+NUM_WORLDS = ("8", "240")
 _PLAY_WORLDS = """
 import json, sys
 from dataclasses import asdict
@@ -71,25 +70,15 @@ from dataclasses import asdict
 import torch
 import service
 from benchmarks.measuring import measure
+from service.config.task import TaskConfig
+from service.methods.task import TaskLearning
 torch.set_num_threads(1)
-task, method, trained = sys.argv[1], "ours", service.load_primitives("panda-cube@champion", "no registry")
-try:
-    from service.config.task import TaskConfig
-    from service.methods.task import TaskLearning
-    config = TaskConfig(task=task, method=method, world=trained.config.world, run={"num_threads": 1})
-    learning = TaskLearning(config, trained)
-    step = learning.step
-except ImportError:  # 0.2 and before
-    from service.methods.task_learner import make_loop
-    from service.methods.task_methods import METHODS
-    from service.methods.settings import make_trial
-    from service.methods.worker import make_worlds
-    trial = make_trial(task=task, method=method)
-    learning = make_loop(trial, METHODS[method], trained, make_worlds(trial, METHODS[method], trained, 1))
-    step = lambda: learning.play(50 * trial.sac.num_worlds)
+trained = service.load_primitives("panda-cube@champion", "no registry")
+config = TaskConfig(task=sys.argv[1], method="ours", world=trained.config.world, run={"num_threads": 1})
+learning = TaskLearning(config, trained)
 def play():
     before = learning.num_env_steps
-    step()
+    learning.step()
     return learning.num_env_steps - before
 for _ in range(3):  # by then it learns
     play()
@@ -99,8 +88,16 @@ print(json.dumps(asdict(measure(play, float(sys.argv[2])))))
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Amount of what is measured."""
+    """What is measured, and how much of it."""
 
+    old: str
+    """A commit."""
+    new: str
+    """A later one."""
+    worlds: bool = False
+    """Bare worlds, 8 and 240, not self-play."""
+    task: str = ""
+    """One that is learned; empty: self-play."""
     trained_steps: int = 500_000
     """Env steps of training before the first measurement."""
     num_pairs: int = 5
@@ -189,19 +186,20 @@ def compare_programs(
     return found
 
 
-def benchmark(old: str, new: str, settings: Settings, *, worlds: bool = False, task: str = "") -> dict[str, Any]:
+def benchmark(settings: Settings) -> dict[str, Any]:
     """Compare two commits in directories that are deleted at the end; a ratio is the new one's speed by the old's."""
-    commits = {"old": full_name(old), "new": full_name(new)}
+    commits = {"old": full_name(settings.old), "new": full_name(settings.new)}
     if commits["old"] == commits["new"]:
-        raise TandemError(f"{old} and {new} are the same commit; name two")
-    first, last = names = [commit[:7] for commit in commits.values()]
+        raise TandemError(f"{settings.old} and {settings.new} are the same commit; name two")
     with worktree(commits["old"]) as before, worktree(commits["new"]) as after, scratch() as home:
-        if worlds or task:
-            program, asked = (_LEARN_TASK, [task]) if task else (_PLAY_WORLDS, [str(num) for num in NUM_WORLDS])
+        if settings.task or settings.worlds:
+            name = "task_speed" if settings.task else "world_speed"
+            program, asked = (_LEARN_TASK, [settings.task]) if settings.task else (_PLAY_WORLDS, NUM_WORLDS)
             found = compare_programs(program, asked, {"old": before, "new": after}, home, settings)
             rows = {num: {name: rates(each) for name, each in samples.items()} for num, samples in found.items()}
             ratios = {num: ratio(samples["new"], samples["old"]) for num, samples in found.items()}
-            return {"commits": commits, "rows": rows, "ratios": ratios}
+            return {"benchmark": name, "commits": commits, "rows": rows, "ratios": ratios}
+        first, last = names = [commit[:7] for commit in commits.values()]
         samples = compare(dict(zip(names, (before, after), strict=True)), home, settings)
     rows = {name: rates(each) for name, each in samples.items()}
     return {"commits": commits, "rows": rows, "ratio": ratio(samples[last], samples[first])}
@@ -214,21 +212,5 @@ def report(result: dict[str, Any]) -> str:
     return f"{rates_table(result['rows'])}\n{describe_ratio('new / old', result['ratio'])}"
 
 
-def main() -> int:
-    """Parse the command line, measure, print."""
-    parser = parser_of(__doc__, Settings())
-    parser.add_argument("old", metavar="OLD", help="a commit")
-    parser.add_argument("new", metavar="NEW", nargs="?", default="HEAD", help="a later one (default: %(default)s)")
-    parser.add_argument("--worlds", action="store_true", help="bare worlds, 8 and 240, not self-play")
-    parser.add_argument("--task", default="", help="learning a task, not self-play")
-    given = parser.parse_args()
-
-    def run(settings: Settings) -> dict[str, Any]:
-        return benchmark(given.old, given.new, settings, worlds=given.worlds, task=given.task)
-
-    name = "task_speed" if given.task else "world_speed" if given.worlds else "throughput"
-    return run_benchmark(name, PACKAGES, given, Settings, run, report)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_benchmark("throughput", PACKAGES, __doc__, Settings, benchmark, report))

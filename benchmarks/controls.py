@@ -11,14 +11,12 @@ in all. What was stopped goes on from its directories; what has its file is not 
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measuring import RECIPE_FILE, ROOT, machine, write_json
-from benchmarks.record_run import PACKAGES
-from benchmarks.run_files import COUNTERS, FORMAT_VERSION, Run, thin
-from benchmarks.tasks import measure_tasks
+from benchmarks.measuring import RECIPE_FILE, ROOT, one_line_errors, write_json
+from benchmarks.record_run import head_of, measure_tasks
+from benchmarks.run_files import COUNTERS, Run, thin
 from benchmarks.trials import NUM_EPISODES, run_trial, trial_config
 from service.base.errors import TandemError
 from service.config import Config, load_config
@@ -43,15 +41,14 @@ BOB_STEPS = 6_000_000
 """Bob's own env steps of every control: those of 10 million of self-play."""
 BOB_SHARE = 0.6
 """Share of all env steps that are Bob's where Alice plays, by the recorded runs of the recipe; it hardly changes."""
-TASKS, METHOD = ("wall", "box", "push"), "ours-her"
+TASKS, METHOD, TRIAL_STEPS = ("wall", "box", "push"), "ours-her", 300_000
+"""What is learned with the primitives of a control."""
 MAX_POINTS = 100
 _KEPT = (*COUNTERS, "evaluation/", "bob/", "alice/valid_fraction", "alice/lifted_fraction")
 
 
 def control_config(recipe: Path, name: str, seed: int, bob_steps: int, settings: list[str]) -> Config:
     """The recipe as a control has it."""
-    if name not in CONTROLS:
-        raise TandemError(f"no control {name!r}; choose one of {', '.join(CONTROLS)}")
     alone = "game.alice_plays=false" in CONTROLS[name]
     steps = bob_steps if alone else round(bob_steps / BOB_SHARE)
     named = [] if name == OURS else [f"name=control-{name}"]  # ours may be the run that made the primitives of a seed
@@ -64,13 +61,9 @@ def record_control(directory: RunDirectory, name: str, downstream: dict[str, Any
     config, records = directory.read_config(), read_records(directory.metrics_file)
     kept = [{key: value for key, value in record.items() if key.startswith(_KEPT)} for record in records]
     bob = load(str(directory.path)).policy
-    return {
-        "format_version": FORMAT_VERSION,
-        "name": f"{name}-{config.seed}",
+    return head_of(config, f"{name}-{config.seed}") | {
         "control": name,
         "overrides": list(CONTROLS[name]),
-        "recorded": machine(*PACKAGES),
-        "config": config.model_dump(mode="json"),
         "env_steps": int(records[-1]["env_steps"]),
         "bob_env_steps": bob_env_steps(records),
         "evaluations": measure_tasks(bob, config, num_episodes=NUM_EPISODES),
@@ -91,23 +84,21 @@ def bob_env_steps(records: list[dict[str, Any]]) -> int:
     return round(total)
 
 
-def run_control(config: Config, name: str, given: argparse.Namespace) -> Run:
-    """Run, or go on with, what a control consists of."""
-    directory = RunDirectory(given.run_dir / f"{name}-{config.seed}")
+def run_control(config: Config, name: str, runs: Path, trial_steps: int = TRIAL_STEPS) -> Run:
+    """Run, or go on with, what a control consists of, in directories below ``runs``."""
+    directory = RunDirectory(runs / f"{name}-{config.seed}")
     resume = directory.exists
     if resume and resumed_config(directory, []) != config:
-        raise TandemError(
-            f"{directory.path} holds a run of another configuration; remove it, or name another --run-dir"
-        )
+        raise TandemError(f"{directory.path} holds a run of another configuration; remove it")
     done = train(config, directory, directory.path, resume=resume, publish=False, on_iteration=_show)
     if done.result.reason == "interrupted":  # what it learned so far is no result
         raise TandemError(f"stopped at {done.result.num_env_steps:,} env steps; the same command goes on from there")
     found = {}
     for task in TASKS:
-        settings = [f"run.total_env_steps={given.steps}", f"run.final_episodes={NUM_EPISODES}"]
+        settings = [f"run.total_env_steps={trial_steps}", f"run.final_episodes={NUM_EPISODES}"]
         settings.append(f"run.num_threads={config.run.num_threads}")
         trial = trial_config(task, METHOD, config.seed, str(directory.path.absolute()), settings)
-        found[task] = run_trial(trial, directory.path, given.run_dir / f"{name}-{config.seed}-{task}")
+        found[task] = run_trial(trial, directory.path, runs / f"{name}-{config.seed}-{task}")
         print(f"  {task}: {found[task]['evaluation']['success_last']:.1%}", flush=True)
     return record_control(directory, name, found)
 
@@ -118,35 +109,25 @@ def _show(metrics: dict[str, float]) -> None:
         print(f"  {metrics['env_steps']:>12,.0f} env steps, {metrics['time/wall_s']:.0f} s: {rates}", flush=True)
 
 
+@one_line_errors
 def main() -> int:
     """Parse the command line, run and record what is not there yet."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add, out = parser.add_argument, ROOT / "docs" / "results" / "controls"
-    add("names", metavar="NAME", nargs="+", help=", ".join(CONTROLS))
+    add("name", choices=CONTROLS)
     add("--seed", type=int, default=0, help="of the run and of its trials (default: %(default)s)")
-    add("--bob-steps", type=int, default=BOB_STEPS, help="Bob's env steps of each run (default: %(default)s)")
-    add("--steps", type=int, default=300_000, help="env steps of each downstream training (default: %(default)s)")
-    add("--config", type=Path, metavar="FILE", default=RECIPE_FILE)
-    add("--set", dest="overrides", metavar="A.B=C", action="append", default=[], help="repeatable")
+    add("--set", dest="settings", metavar="A.B=C", action="append", default=[], help="repeatable")
     add("--run-dir", type=Path, metavar="DIR", default=Path("runs") / "controls", help="default: %(default)s")
     add("--out", type=Path, metavar="DIR", default=out, help="for the recorded files")
     given = parser.parse_args()
-    try:
-        configs = {
-            name: control_config(given.config, name, given.seed, given.bob_steps, given.overrides)
-            for name in given.names
-        }
-        for name, config in configs.items():
-            file = given.out / f"{name}-{given.seed}.json"
-            print(f"{name}: {', '.join(CONTROLS[name]) or 'nothing changed'}", flush=True)
-            if file.exists():
-                print(f"  skipped, {file} is there")
-                continue
-            write_json(file, run_control(config, name, given))
-            print(f"  {file}: {file.stat().st_size / 1000:.0f} kB", flush=True)
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    file = given.out / f"{given.name}-{given.seed}.json"
+    if file.exists():
+        print(f"skipped, {file} is there")
+        return 0
+    config = control_config(RECIPE_FILE, given.name, given.seed, BOB_STEPS, given.settings)
+    print(f"{given.name}: {', '.join(CONTROLS[given.name]) or 'nothing changed'}", flush=True)
+    write_json(file, run_control(config, given.name, given.run_dir))
+    print(f"{file}: {file.stat().st_size / 1000:.0f} kB")
     return 0
 
 

@@ -11,10 +11,7 @@ is the physics of pre-training, half as many steps of 4 ms; panda-gym is not com
 
 from __future__ import annotations
 
-import os
-import sys
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +19,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.measuring import describe_ratio, measure_in_turn, parser_of, rates, rates_table, ratio, run_benchmark
+from benchmarks.measuring import describe_ratio, measure_in_turn, rates, rates_table, ratio, run_benchmark
 from service.base.errors import TandemError
 from service.config import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
@@ -139,12 +136,11 @@ def contenders(num_worlds: int) -> dict[str, BatchContender | GymnasiumContender
 
 def panda_gym(name: str, *, grasping: bool = False) -> GymnasiumContender:
     """An environment of panda-gym."""
-    with _silent_stdout():  # PyBullet prints its arguments
-        try:
-            import panda_gym  # noqa: F401 - registers its environments
-        except ImportError as error:
-            raise TandemError(f"panda-gym cannot be imported ({error}): run `make bench`, which installs it") from None
-        return GymnasiumContender(name, grasping=grasping)
+    try:
+        import panda_gym  # noqa: F401 - registers its environments
+    except ImportError as error:
+        raise TandemError(f"panda-gym cannot be imported ({error}): run `make bench`, which installs it") from None
+    return GymnasiumContender(name, grasping=grasping)
 
 
 def benchmark(settings: Settings) -> dict[str, Any]:
@@ -166,29 +162,11 @@ def measure_rows(rows: Mapping[str, BatchContender | GymnasiumContender], settin
     return {"rows": {name: rates(each) for name, each in samples.items()}, "ratios": ratios}
 
 
-@contextmanager
-def _silent_stdout() -> Iterator[None]:
-    sys.stdout.flush()
-    with ExitStack() as stack:
-        kept, nothing = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-        stack.callback(os.close, kept)
-        stack.callback(os.close, nothing)
-        stack.callback(os.dup2, kept, 1)
-        os.dup2(nothing, 1)
-        yield
-
-
 def report(result: dict[str, Any]) -> str:
     """A result for people."""
     ratios = [describe_ratio(name, each) for name, each in result["ratios"].items()]
     return "\n".join([rates_table(result["rows"]), *ratios])
 
 
-def main() -> int:
-    """Parse the command line, measure, print."""
-    given = parser_of(__doc__, Settings()).parse_args()
-    return run_benchmark("env_throughput", PACKAGES, given, Settings, benchmark, report)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_benchmark("env_throughput", PACKAGES, __doc__, Settings, benchmark, report))

@@ -8,6 +8,7 @@ that they need is not there or fails; ``run_benchmark`` prints its one line.
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib.metadata
 import json
 import os
@@ -17,7 +18,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,7 +27,7 @@ from benchmarks.report.markdown import table
 from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
 from service.base.version import git_commit
-from service.registry.loading import load
+from service.registry.loading import Trained, load
 
 ROOT = Path(__file__).parents[1]
 RECIPE_FILE = ROOT / "configs" / "pretrain" / "panda_cube.yaml"
@@ -145,63 +146,87 @@ def to_text(value: Any) -> str:
 # --- the command line of a benchmark ----------------------------------------------------------------------------------
 
 
-def parser_of(doc: str | None, settings: Any) -> argparse.ArgumentParser:
-    """A parser with an option for every field of ``settings``, a dataclass whose values are the defaults."""
+def read_settings(doc: str | None, settings: type[_Settings]) -> tuple[_Settings, Path | None]:
+    """A dataclass from the command line, and where to write the result.
+
+    A field with a default is an option, one without is an argument; a tuple takes several values.
+    """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for field in fields(settings):
-        value, option = getattr(settings, field.name), f"--{field.name.replace('_', '-')}"
-        parser.add_argument(option, type=type(value), default=value, help="default: %(default)s")
+    for field in fields(settings):  # type: ignore[arg-type]
+        option, value = f"--{field.name.replace('_', '-')}", field.default
+        if value is MISSING:
+            parser.add_argument(field.name, nargs="+" if str(field.type).startswith("tuple") else None)
+        elif value is False:
+            parser.add_argument(option, action="store_true")
+        elif isinstance(value, tuple):
+            parser.add_argument(option, action="append", default=[])
+        else:
+            parser.add_argument(option, type=type(value), default=value, help="default: %(default)s")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything measured")
-    return parser
+    given = vars(parser.parse_args())
+    file = given.pop("json")
+    return settings(**{name: tuple(each) if isinstance(each, list) else each for name, each in given.items()}), file
 
 
 def run_benchmark(
     name: str,
     packages: Sequence[str],
-    given: argparse.Namespace,
+    doc: str | None,
     settings: type[_Settings],
     benchmark: Callable[[_Settings], dict[str, Any]],
     report: Callable[[dict[str, Any]], str],
     failed: Callable[[dict[str, Any]], bool] = lambda result: False,
 ) -> int:
-    """Measure, write ``--json`` under the benchmark's name, print the report; the exit code, 1 where it has failed.
+    """Measure with the settings of the command line, write ``--json``, print the report.
 
-    ``settings`` is the dataclass that ``parser_of`` had, and what ``benchmark`` takes; ``packages`` are those whose
-    versions matter.
+    Args:
+        name: of the benchmark in its file; a result that has another one keeps it.
+        packages: those whose versions matter.
+        doc: what ``--help`` says.
+        settings: a dataclass, see ``read_settings``.
+        benchmark: measures.
+        report: the result for people.
+        failed: whether the exit code is 1.
     """
-    try:
+    chosen, file = read_settings(doc, settings)
+
+    @one_line_errors
+    def program() -> int:
         where = machine(*packages)
         print(describe(where), flush=True)
-        chosen = settings(**{field.name: getattr(given, field.name) for field in fields(settings)})  # type: ignore[arg-type]
         head = {"benchmark": name, "machine": where, "settings": asdict(chosen)}  # type: ignore[call-overload]
         result = head | benchmark(chosen)
-        if given.json is not None:
-            write_json(given.json, result)
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(report(result))
-    return int(failed(result))
+        if file is not None:
+            write_json(file, result)
+        print(report(result))
+        return int(failed(result))
+
+    return program()
 
 
-def primitives_benchmark(
-    name: str, packages: Sequence[str], doc: str | None, defaults: _Settings, measure: Callable[..., dict[str, Any]],
-    report: Callable[[dict[str, Any]], str],
-) -> int:  # fmt: skip
-    """The command line of a benchmark that calls ``measure`` with each of the primitives that it is given."""
-    parser = parser_of(doc, defaults)
-    parser.add_argument("primitives", nargs="+", metavar="NAME@ALIAS|RUN_DIR")
-    parser.add_argument("--registry", default="registry")
-    given = parser.parse_args()
+def one_line_errors(main: Callable[[], int]) -> Callable[[], int]:
+    """A program that prints the one line of an error that a user can correct, and then ends with 2."""
 
-    def benchmark(settings: _Settings) -> dict[str, Any]:
-        rows = {}
-        for reference in given.primitives:
-            trained = load(reference, given.registry)
-            rows[reference] = {"name": trained.name, "digest": trained.digest, **measure(trained, settings)}
-        return {"rows": rows}
+    @functools.wraps(main)
+    def program() -> int:
+        try:
+            return main()
+        except TandemError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 2
 
-    return run_benchmark(name, packages, given, type(defaults), benchmark, report)
+    return program
+
+
+def of_each(
+    primitives: Sequence[str], registry: str, measure: Callable[[Trained], dict[str, Any]]
+) -> dict[str, dict[str, Any]]:
+    """What ``measure`` says of each of the primitives, with their names and digests, by reference."""
+    loaded = {reference: load(reference, registry) for reference in primitives}
+    return {
+        reference: {"name": trained.name, "digest": trained.digest, **measure(trained)}
+        for reference, trained in loaded.items()
+    }
 
 
 def _cpu_model() -> str:

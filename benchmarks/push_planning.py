@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.measuring import primitives_benchmark
+from benchmarks.measuring import of_each, run_benchmark
 from service.actors.evaluation import wilson_interval
 from service.envs.batch import WorldBatch
 from service.envs.sampling import Places, draw_goals
@@ -41,8 +41,11 @@ _LEAST_STD = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Amount of what is measured."""
+    """What is measured, and how much of it."""
 
+    primitives: tuple[str, ...]
+    """``NAME@ALIAS``, or run directories."""
+    registry: str = "registry"
     task: str = "push"
     num_goals: int = 300
     num_plans: int = 48
@@ -99,9 +102,9 @@ class _Search:
         return distance.reshape(plans.shape[:2]), (cost + distance).reshape(plans.shape[:2])
 
 
-def measure(trained: Trained, task_name: str, settings: Settings) -> dict[str, Any]:
+def measure(trained: Trained, settings: Settings) -> dict[str, Any]:
     """Share of the goals of a task that plans reach at the last step."""
-    task, primitives = find_task(task_name), check_primitives(trained)
+    task, primitives = find_task(settings.task), check_primitives(trained)
     rng = np.random.default_rng(settings.seed)
     found: list[float] = []
     num_worlds = settings.goals_at_once * settings.num_plans
@@ -114,6 +117,11 @@ def measure(trained: Trained, task_name: str, settings: Settings) -> dict[str, A
     return {"reached": reached / settings.num_goals, "low": low, "high": high}
 
 
+def benchmark(settings: Settings) -> dict[str, Any]:
+    """Measure each of the primitives."""
+    return {"rows": of_each(settings.primitives, settings.registry, lambda trained: measure(trained, settings))}
+
+
 def report(result: dict[str, Any]) -> str:
     """A result for people."""
     settings = result["settings"]
@@ -124,17 +132,5 @@ def report(result: dict[str, Any]) -> str:
     )
 
 
-def main() -> int:
-    """Parse the command line, measure, print, write."""
-    return primitives_benchmark(
-        "push_planning",
-        PACKAGES,
-        __doc__,
-        Settings(),
-        lambda trained, settings: measure(trained, settings.task, settings),
-        report,
-    )
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_benchmark("push_planning", PACKAGES, __doc__, Settings, benchmark, report))

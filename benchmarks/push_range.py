@@ -8,12 +8,12 @@ push straight or none does. What none can do has to be planned round downstream,
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.measuring import primitives_benchmark
+from benchmarks.measuring import of_each, run_benchmark
 from service.methods.compose import check_primitives
 from service.registry.learned import action_weights
 
@@ -40,8 +40,11 @@ _ASIDE_OF = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Amount of what is measured."""
+    """What is measured, and how much of it."""
 
+    primitives: tuple[str, ...]
+    """``NAME@ALIAS``, or run directories."""
+    registry: str = "registry"
     num_places: int = 600
     """Places of the object, for each direction."""
     num_weights: int = 800
@@ -85,6 +88,13 @@ def measure(trained: Trained, *, num_places: int, num_weights: int, seed: int) -
     return shares
 
 
+def benchmark(settings: Settings) -> dict[str, Any]:
+    """Measure each of the primitives."""
+    amount = {name: getattr(settings, name) for name in ("num_places", "num_weights", "seed")}
+    rows = of_each(settings.primitives, settings.registry, lambda trained: {"impossible": measure(trained, **amount)})
+    return {"rows": rows}
+
+
 def report(result: dict[str, Any]) -> str:
     """A result for people."""
     return "\n".join(
@@ -93,17 +103,5 @@ def report(result: dict[str, Any]) -> str:
     )
 
 
-def main() -> int:
-    """Parse the command line, measure, print, write."""
-    return primitives_benchmark(
-        "push_range",
-        PACKAGES,
-        __doc__,
-        Settings(),
-        lambda trained, settings: {"impossible": measure(trained, **asdict(settings))},
-        report,
-    )
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_benchmark("push_range", PACKAGES, __doc__, Settings, benchmark, report))

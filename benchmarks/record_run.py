@@ -4,8 +4,8 @@
     python -m benchmarks.record_run runs/lsd-0 --skills --out docs/results/skills/lsd-0.json
 
 It holds the configuration, the metrics thinned to at most 300 points, a sample of the goals in the layout of
-``goals.jsonl`` and counts of all of them, and what is measured here: the newest Bob on every task (``tasks.py``), and
-the coverage of random compositions at three stages of training (``coverage.py``). That takes a minute or two.
+``goals.jsonl`` and counts of all of them, and what is measured here: the newest Bob on every task (``TASKS``), and
+the coverage of random compositions at three stages of training. That takes a minute or two.
 
 With ``--skills`` it holds less: at most 100 points, and the coverage of random skills of 50 steps, an episode of the
 downstream tasks. Of self-play a skill is a random composition of the primitives.
@@ -15,23 +15,29 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.coverage import measure_coverage
-from benchmarks.measuring import machine, write_json
-from benchmarks.run_files import COUNTERS, FORMAT_VERSION, Records, Run, blocks, thin
-from benchmarks.tasks import measure_tasks
+from benchmarks.measuring import machine, one_line_errors, write_json
+from benchmarks.run_files import CELL_SIZE_M, COUNTERS, FORMAT_VERSION, RANDOM, STAGES, Records, Run, blocks, thin
+from service.actors.coverage import NUM_SKILLS, RandomPolicy, skill_paths, skill_trajectories, visited_share
+from service.actors.evaluation import DeterministicPolicy, IdlePolicy, evaluate
 from service.base.errors import TandemError
 from service.base.types import StateArray
+from service.config import Config
 from service.config.skills import SkillDiscoveryConfig
-from service.envs.tasks import EPISODE_STEPS
+from service.envs.tasks import EPISODE_STEPS, Task
+from service.envs.tasks import TASKS as DOWNSTREAM
+from service.media.artifacts import COVERAGE_STEPS
 from service.media.figures import read_records
-from service.policies.numpy_policy import numpy_bob
+from service.policies.frozen_skills import FrozenSkills
+from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
+from service.policies.parameters import Parameters
 from service.registry.loading import read_stages
 from service.store.run_directory import RunDirectory
 
@@ -48,19 +54,43 @@ OURS = "ours"
 SKILL_POINTS = 100
 KEPT_OF_SKILLS = (*COUNTERS, "evaluation/coverage", "skills/", "bob/env_steps_fraction")
 """Beginnings of the names of metrics that are kept of skills."""
+NUM_EPISODES, NUM_STEPS = 300, 50
+ASKED, ASKED_STEPS = 0.90, 30e6
+"""Success on mixed goals at the last step, after at most so many env steps from scratch."""
+SEED = 0
+"""Seed of the goals; those evaluated during a run are others."""
+
+TASKS = {
+    "mixed": Task("Mixed", "anywhere in the workspace with probability 0.7, else on the table", "mixed"),
+    "air": Task("Air", "more than 5 cm above an object that rests on the table", "air"),
+    "table": Task("Table", "on the table", "table"),
+    "larger": DOWNSTREAM["larger"],
+    "sphere": DOWNSTREAM["sphere"],
+}
+ASKED_RATES = {"mixed": 0.95, "air": 0.95, "table": 0.95, "larger": 0.90, "sphere": 0.85}
+"""Success at the last step that we ask of Bob."""
+NUM_SETS = 10
+KEPT_EVERY = 4
+"""Steps of a path; it is drawn, not measured."""
+_Player = Callable[..., StateArray]
+"""Plays the random skills of a ``seed``; their paths."""
+
+
+def head_of(config: Config, name: str) -> Run:
+    """What every file of a run begins with; ``name`` is for tables."""
+    recorded = machine(*PACKAGES)
+    return {
+        "format_version": FORMAT_VERSION, "name": name, "recorded": recorded, "config": config.model_dump(mode="json")
+    }  # fmt: skip
 
 
 def record_run(directory: RunDirectory, name: str, note: str = "") -> Run:
     """Everything that is kept of a run without measuring anything; ``name`` is for tables, ``note`` for people."""
     config = directory.read_config()
     goals = read_records(directory.goals_file)
-    return {
-        "format_version": FORMAT_VERSION,
-        "name": name,
+    return head_of(config, name) | {
         "note": note,
-        "recorded": machine(*PACKAGES),
         "environment": _environment(directory),
-        "config": config.model_dump(mode="json"),
         "series": thin(read_records(directory.metrics_file)),
         "curriculum": count_goals(goals, config.world.rest_height_m),
         "goals": sample_goals(goals),
@@ -84,13 +114,9 @@ def record_skills(directory: RunDirectory, name: str, note: str = "") -> Run:
         {key: value for key, value in record.items() if key.startswith(KEPT_OF_SKILLS)}
         for record in read_records(directory.metrics_file)
     ]
-    return {
-        "format_version": FORMAT_VERSION,
-        "name": name,
+    return head_of(config, name) | {
         "note": note,
         "method": config.skills.method if isinstance(config, SkillDiscoveryConfig) else OURS,
-        "recorded": machine(*PACKAGES),
-        "config": config.model_dump(mode="json"),
         "series": thin(kept, SKILL_POINTS),
         "coverage": coverage,
     }
@@ -142,6 +168,80 @@ def _environment(directory: RunDirectory) -> dict[str, Any]:
     return environment
 
 
+def measure_tasks(
+    bob: DeterministicPolicy, config: Config, *, num_episodes: int = NUM_EPISODES, num_steps: int = NUM_STEPS
+) -> list[dict[str, Any]]:
+    """Bob without noise and a policy that does nothing, from fresh resets.
+
+    Returns:
+        Rows as ``tandem evaluate --json`` prints them; ``policy`` is "bob" or "idle", ``goals`` the task's name.
+    """
+    rows = []
+    for name, task in TASKS.items():
+        for label, policy in {"bob": bob, "idle": IdlePolicy()}.items():
+            result = evaluate(
+                policy,
+                task.world_from(config.world),
+                task.goals,
+                num_episodes=num_episodes,
+                num_steps=num_steps,
+                success_distance_m=config.success_distance_m,
+                seed=SEED,
+                num_threads=config.run.num_threads,
+            )
+            rows.append({"policy": label, **result.as_dict(), "goals": name})
+    return rows
+
+
+def pick_stages(env_steps: Collection[int]) -> dict[str, int]:
+    """Snapshots nearest to the stages' shares of a run; one that is nearest to several shows the last of them."""
+    steps = np.sort(list(env_steps))
+    nearest = {int(steps[np.abs(steps - share * steps[-1]).argmin()]): name for name, share in STAGES.items()}
+    return {name: at for at, name in nearest.items()}
+
+
+def measure_coverage(
+    stages: Mapping[int, Parameters], config: Config, *, num_sets: int = NUM_SETS, num_steps: int = COVERAGE_STEPS
+) -> dict[str, Any] | None:
+    """The share of the workspace's table cells of 5 cm that each stage's random skills move the object into.
+
+    Args:
+        stages: parameters of Bob, or of skills, by env steps of training.
+        config: of the run.
+        num_sets: sets of 32 skills, each from a seed of its own, the same for all stages.
+        num_steps: of each skill.
+
+    Returns:
+        For JSON; None for a monolithic Bob, who has nothing to compose.
+    """
+    common: dict[str, Any] = {"num_skills": NUM_SKILLS, "num_steps": num_steps, "num_threads": config.run.num_threads}
+
+    def player(parameters: Parameters) -> _Player | None:
+        if isinstance(config, SkillDiscoveryConfig):
+            return partial(skill_paths, FrozenSkills(parameters, config.skills.method), config.world, **common)
+        bob = numpy_bob(parameters)
+        return partial(skill_trajectories, bob, config.world, **common) if isinstance(bob, NumpyMCPPolicy) else None
+
+    found: dict[str, dict[str, Any]] = {
+        RANDOM: _measure_sets(partial(skill_trajectories, RandomPolicy(), config.world, **common), config, num_sets)
+    }
+    for name, env_steps in pick_stages(stages).items():
+        if (play := player(stages[env_steps])) is None:
+            return None
+        found[name] = {"env_steps": env_steps, **_measure_sets(play, config, num_sets)}
+    return {"num_skills": NUM_SKILLS, "num_steps": num_steps, "cell_size_m": CELL_SIZE_M, "stages": found}
+
+
+def _measure_sets(play: _Player, config: Config, num_sets: int) -> dict[str, Any]:
+    sets = [play(seed=seed) for seed in range(num_sets)]
+    kept = np.round(1000 * sets[0][:, ::KEPT_EVERY]).astype(int)
+    return {
+        "shares": [round(visited_share(paths, config.world.workspace, cell_size_m=CELL_SIZE_M), 4) for paths in sets],
+        "paths_mm": kept.reshape(NUM_SKILLS, -1).tolist(),
+    }
+
+
+@one_line_errors
 def main() -> int:
     """Parse the command line, read, measure, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -151,15 +251,11 @@ def main() -> int:
     parser.add_argument("--skills", action="store_true", help="where its random skills take the object, and less else")
     given = parser.parse_args()
     directory, name = RunDirectory(given.run_dir), given.out.stem
-    try:
-        if given.skills:
-            run = record_skills(directory, name, given.note)
-        else:
-            run = record_run(directory, name, given.note) | measure_run(directory)
-        write_json(given.out, run)
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    if given.skills:
+        run = record_skills(directory, name, given.note)
+    else:
+        run = record_run(directory, name, given.note) | measure_run(directory)
+    write_json(given.out, run)
     print(f"{given.out}: {given.out.stat().st_size / 1000:.0f} kB")
     return 0
 

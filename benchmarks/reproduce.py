@@ -15,7 +15,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,17 +33,9 @@ SKILL_HOLD_STEPS = 1
 """Env steps that an orchestrator holds a skill; 1, 5 and 25 were compared (log, T20)."""
 CONTROL_SEEDS = (0, 2)
 LONGER_ENV_STEPS = 1_000_000
+RESULTS, RUNS = ROOT / "docs" / "results", ROOT / "runs" / "reproduce"
+"""Recorded files, and run directories."""
 Command = tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Places:
-    """Directories that experiments read and write."""
-
-    out: Path
-    """Recorded files; the registry of primitives and skills is in its ``primitives``."""
-    runs: Path
-    """Run directories."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,111 +50,103 @@ class Experiment:
     part: str
     """What it is in its group, besides its seed."""
     seed: int
-    commands: Callable[[], Sequence[Command]]
-    """What to run, in this order, which may depend on what is there already."""
+    commands: Sequence[Command]
+    """What to run, in this order."""
     needs: Path | None = None
     """It can be run if this is there."""
 
 
-def experiments(places: Places) -> Iterator[Experiment]:
-    """Everything, the most important first."""
+def experiments(out: Path = RESULTS) -> Iterator[Experiment]:
+    """Everything, the most important first; ``out`` has recorded files, and the registry in its ``primitives``."""
     tasks = tuple(TASKS)
     for seed in PRIMITIVES:
         for method in ("ours-her", "ours", "ours-residual-her"):
-            yield from (_trial(places, task, method, seed) for task in tasks)
-        yield from (_trial(places, task, method, seed) for method in ("asp-only", "idle") for task in tasks)
-    yield from (_control(places, name, CONTROL_SEEDS[0]) for name in CONTROLS)
+            yield from (_trial(out, task, method, seed) for task in tasks)
+        yield from (_trial(out, task, method, seed) for method in ("asp-only", "idle") for task in tasks)
+    yield from (_control(out, name, CONTROL_SEEDS[0]) for name in CONTROLS)
     nothing = ("scratch-monolithic-her", "scratch-monolithic", "scratch-mcp-her", "scratch-mcp")
-    yield from (_trial(places, task, method, 0) for method in nothing for task in tasks)
-    yield from _skills(places, 0)
-    yield from (_trial(places, task, f"scratch-{net}-her", 1) for net in ("monolithic", "mcp") for task in tasks)
-    yield from (_control(places, name, CONTROL_SEEDS[1]) for name in CONTROLS)
-    yield from _skills(places, 1)
-    yield from (_trial(places, task, f"scratch-{net}-her", 2) for net in ("monolithic", "mcp") for task in tasks)
-    yield from _skills(places, 2)
+    yield from (_trial(out, task, method, 0) for method in nothing for task in tasks)
+    yield from _skills(out, 0)
+    yield from (_trial(out, task, f"scratch-{net}-her", 1) for net in ("monolithic", "mcp") for task in tasks)
+    yield from (_control(out, name, CONTROL_SEEDS[1]) for name in CONTROLS)
+    yield from _skills(out, 1)
+    yield from (_trial(out, task, f"scratch-{net}-her", 2) for net in ("monolithic", "mcp") for task in tasks)
+    yield from _skills(out, 2)
     for seed in (1, 2):
-        yield from (_trial(places, task, f"scratch-{net}", seed) for net in ("monolithic", "mcp") for task in tasks)
+        yield from (_trial(out, task, f"scratch-{net}", seed) for net in ("monolithic", "mcp") for task in tasks)
     for seed in (0, 1):
         for method in ("ours-her", "ours", "scratch-monolithic-her", "scratch-monolithic"):
-            yield _trial(places, "hard-push", method, seed)
+            yield _trial(out, "hard-push", method, seed)
     for task in ("push", "inair", "sphere"):
-        yield from (_longer(places, task, f"scratch-{net}-her") for net in ("monolithic", "mcp"))
-    yield from (_longer(places, "push", method) for method in ("ours-her", "ours-residual-her"))
+        yield from (_longer(out, task, f"scratch-{net}-her") for net in ("monolithic", "mcp"))
+    yield from (_longer(out, "push", method) for method in ("ours-her", "ours-residual-her"))
 
 
-def _trial(places: Places, task: str, method: str, seed: int) -> Experiment:
-    return _table(places, "downstream", task, method, seed, PRIMITIVES[seed])
+def _trial(out: Path, task: str, method: str, seed: int) -> Experiment:
+    return _table(out, "downstream", task, method, seed, PRIMITIVES[seed])
 
 
-def _longer(places: Places, task: str, method: str) -> Experiment:
+def _longer(out: Path, task: str, method: str) -> Experiment:
     extra = ("--set", f"run.total_env_steps={LONGER_ENV_STEPS}")
-    found = _table(places, "downstream_longer", task, method, 0, PRIMITIVES[0], extra)
+    found = _table(out, "downstream_longer", task, method, 0, PRIMITIVES[0], extra)
     return replace(found, group="a million env steps", part=f"{task}-{method}")
 
 
 def _table(
-    places: Places, directory: str, task: str, method: str, seed: int, reference: str, extra: Command = ()
+    out: Path, directory: str, task: str, method: str, seed: int, reference: str, extra: Command = ()
 ) -> Experiment:
     """A trial with primitives or skills of the recorded registry."""
-    name, file = f"{directory}/{task}-{method}-{seed}", places.out / directory / f"{task}-{method}-{seed}.json"
+    name, file = f"{directory}/{task}-{method}-{seed}", out / directory / f"{task}-{method}-{seed}.json"
     command = _python(
-        *("-m", "benchmarks.trials", task, method, str(seed), "--primitives", reference, "--out", str(file)),
-        *("--registry", str(places.out / "primitives"), "--runs", str(places.runs / directory)),
+        *("benchmarks.trials", task, method, str(seed), "--primitives", reference, "--out", str(file)),
+        *("--registry", str(out / "primitives"), "--runs", str(RUNS / directory)),
         *("--set", "run.num_threads=1", *extra),
     )
-    versions = places.out / "primitives" / "models" / reference.partition("@")[0]
+    versions = out / "primitives" / "models" / reference.partition("@")[0]
     group, part = (METHODS[method].title, task) if task in TASKS else (find_task(task).title, method)
-    return Experiment(name, file, group, part, seed, lambda: [command], versions)
+    return Experiment(name, file, group, part, seed, (command,), versions)
 
 
-def _control(places: Places, name: str, seed: int) -> Experiment:
-    out = places.out / "controls"
+def _control(out: Path, name: str, seed: int) -> Experiment:
+    out /= "controls"
     command = _python(
-        *("-m", "benchmarks.controls", name, "--seed", str(seed)),
-        *("--run-dir", str(places.runs / "controls"), "--out", str(out), "--set", "run.num_threads=1"),
+        *("benchmarks.controls", name, "--seed", str(seed)),
+        *("--run-dir", str(RUNS / "controls"), "--out", str(out), "--set", "run.num_threads=1"),
     )
     file = out / f"{name}-{seed}.json"
-    return Experiment(f"controls/{name}-{seed}", file, "controls of self-play", name, seed, lambda: [command])
+    return Experiment(f"controls/{name}-{seed}", file, "controls of self-play", name, seed, (command,))
 
 
-def _skills(places: Places, seed: int) -> Iterator[Experiment]:
+def _skills(out: Path, seed: int) -> Iterator[Experiment]:
     """Skill discovery, and what is learned downstream with the skills."""
     for method in SKILL_METHODS:
-        yield _discover(places, method, seed)
+        yield _discover(out, method, seed)
     for method in SKILL_METHODS:
         rows = (method, f"{method}-zero-shot") if method in ("lsd", "metra") else (method,)
         hold = ("--set", f"skill_steps={SKILL_HOLD_STEPS}")
         for row in rows:
             for task in TASKS:
                 settings = hold if row == method else ()
-                yield _table(places, "downstream", task, row, seed, f"{_skills_name(method, seed)}@1", settings)
+                yield _table(out, "downstream", task, row, seed, f"{_skills_name(method, seed)}@1", settings)
 
 
 def _skills_name(method: str, seed: int) -> str:
     return f"panda-cube-{method}-{seed}"
 
 
-def _discover(places: Places, method: str, seed: int) -> Experiment:
-    run, file = places.runs / f"{method}-{seed}", places.out / "skills" / f"{method}-{seed}.json"
-    train = _tandem(
-        *("train", f"panda-cube-{method}", "--run-dir", str(run)),
-        *("--registry", str(places.out / "primitives"), "--set", f"name={_skills_name(method, seed)}"),
+def _discover(out: Path, method: str, seed: int) -> Experiment:
+    run, file = RUNS / f"{method}-{seed}", out / "skills" / f"{method}-{seed}.json"
+    train = _python(
+        *("service", "train", f"panda-cube-{method}", "--run-dir", str(run), "--resume", "auto"),
+        *("--registry", str(out / "primitives"), "--set", f"name={_skills_name(method, seed)}"),
         *("--set", f"seed={seed}", "--set", f"run.total_env_steps={SKILL_ENV_STEPS}", "--set", "run.num_threads=1"),
     )
-    record = _python("-m", "benchmarks.record_run", str(run), "--skills", "--out", str(file))
-
-    def commands() -> Sequence[Command]:
-        return [(*train, "--resume") if run.exists() else train, record]
-
-    return Experiment(f"skills/{method}-{seed}", file, "skill discovery", method, seed, commands)
+    record = _python("benchmarks.record_run", str(run), "--skills", "--out", str(file))
+    return Experiment(f"skills/{method}-{seed}", file, "skill discovery", method, seed, (train, record))
 
 
 def _python(*arguments: str) -> Command:
-    return (sys.executable, *arguments)
-
-
-def _tandem(*arguments: str) -> Command:
-    return _python("-m", "service", *arguments)
+    return (sys.executable, "-m", *arguments)
 
 
 def run_all(waiting: Sequence[Experiment], parallel: int, logs: Path) -> list[str]:
@@ -186,7 +170,7 @@ def _run_one(experiment: Experiment, logs: Path) -> None:
     started = time.monotonic()
     print(f"{experiment.name} ...", flush=True)
     with (logs / f"{experiment.name.replace('/', '-')}.log").open("ab") as log:
-        code = _run(experiment.commands(), log.fileno())
+        code = _run(experiment.commands, log.fileno())
     print(f"{experiment.name}: exit code {code}, {(time.monotonic() - started) / 60:.1f} min", flush=True)
 
 
@@ -202,25 +186,21 @@ def _run(commands: Sequence[Command], log: int) -> int:
 def main() -> int:
     """Parse the command line, run what is missing."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    results = ROOT / "docs" / "results"
-    parser.add_argument("--out", type=Path, metavar="DIR", default=results, help="for the recorded files")
-    parser.add_argument("--runs", type=Path, metavar="DIR", default=Path("runs") / "reproduce", help="run directories")
     parser.add_argument("--parallel", type=int, metavar="N", default=1, help="at once (default: %(default)s)")
     parser.add_argument("--list", action="store_true", help="print what is missing, and stop")
     given = parser.parse_args()
-    places = Places(given.out.absolute(), given.runs.absolute())
-    everything = list(experiments(places))
+    everything = list(experiments())
     missing = [each for each in everything if not each.file.exists()]
     print(f"{len(everything) - len(missing)} of {len(everything)} are there, {len(missing)} to run")
     if given.list:
         for experiment in missing:
             print(experiment.name)
-            for command in experiment.commands():
+            for command in experiment.commands:
                 print("   ", *command)
         return 0
-    failed = run_all(missing, given.parallel, places.runs / "logs")
+    failed = run_all(missing, given.parallel, RUNS / "logs")
     for name in failed:
-        print(f"failed: {name}; its output is in {places.runs / 'logs'}", file=sys.stderr)
+        print(f"failed: {name}; its output is in {RUNS / 'logs'}", file=sys.stderr)
     return 1 if failed else 0
 
 

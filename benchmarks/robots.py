@@ -5,13 +5,12 @@
 
 Each of ``configs/robots`` picks a cube up, carries it to a random place in the air and holds it there for 5 s, by a
 hand-written policy. Env steps are of random actions with one thread, in turn with the Panda's. A run is one of
-``tandem pretrain`` with that robot. What the file has of robots that are not measured now stays: the Panda with other
-objects was measured by this program of 82ca6fd.
+``tandem pretrain`` with that robot. Robots whose models are not installed are left out. What the recorded file has of
+them stays: the Panda with other objects was measured by this program of 82ca6fd.
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import json
 from dataclasses import dataclass
@@ -21,14 +20,14 @@ from typing import Any
 import numpy as np
 
 from benchmarks.env_throughput import BatchContender
-from benchmarks.measuring import RECIPE_FILE, ROOT, measure_in_turn, parser_of, ratio, run_benchmark
+from benchmarks.measuring import RECIPE_FILE, ROOT, measure_in_turn, ratio, run_benchmark
 from service.base.errors import ConfigError
 from service.base.jsonl import read_jsonl
 from service.config import Config, WorldConfig, load_config
 from service.envs.batch import WorldBatch
 from service.store.run_directory import RunDirectory
 
-ROBOTS = ROOT / "configs" / "robots"
+ROBOTS, RECORDED = ROOT / "configs" / "robots", ROOT / "docs" / "results" / "robots.json"
 OVERRIDES = {"viperx": ("world.workspace.height_m=0.25",), "jaco": ("world.workspace.height_m=0.25",)}
 """What these arms need of a world: they do not reach the upper corners of the usual one."""
 NUM_WORLDS = (8, 240)
@@ -39,8 +38,10 @@ LAST_STEPS = 200_000
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Amount of what is measured."""
+    """What is measured, and how much of it."""
 
+    run: tuple[str, ...] = ()
+    """``NAME=DIR``, runs with that robot."""
     num_picks: int = 100
     num_pairs: int = 5
     seconds: float = 2.0
@@ -99,37 +100,21 @@ def report(result: dict[str, Any]) -> str:
     return json.dumps(result["robots"], indent=1)
 
 
-def main() -> int:
-    """Parse the command line, measure, print."""
-    parser = parser_of(__doc__, Settings())
-    parser.add_argument("--run", action="append", default=[], metavar="NAME=DIR", help="a run with that robot")
-    parser.add_argument("--robots", nargs="*", metavar="NAME", help="default: all whose models are installed")
-    given = parser.parse_args()
-    return run_benchmark(
-        "robots", ("mujoco", "numpy"), given, Settings, lambda chosen: _benchmark(chosen, given), report
-    )
-
-
-def _benchmark(settings: Settings, given: argparse.Namespace) -> dict[str, Any]:
-    before = json.loads(given.json.read_text()) if given.json is not None and given.json.exists() else {"robots": {}}
-    robots: dict[str, dict[str, Any]] = {name: dict(each) for name, each in before["robots"].items()}
-    names = [path.stem for path in sorted(ROBOTS.glob("*.yaml"))] if given.robots is None else given.robots
-    for name in names:
+def benchmark(settings: Settings) -> dict[str, Any]:
+    """Measure every robot whose model is there, and summarise the runs; what was recorded of others stays."""
+    robots: dict[str, dict[str, Any]] = json.loads(RECORDED.read_text())["robots"]
+    for path in sorted(ROBOTS.glob("*.yaml")):
         try:
-            world_of(name)
+            world_of(path.stem)
         except ConfigError as error:
-            if given.robots is not None:
-                raise
-            print(f"without {name}: {error}", flush=True)
+            print(f"without {path.stem}: {error}", flush=True)
             continue
-        robots.setdefault(name, {}).update(measure_robot(name, settings))
-    for run in given.run:
-        name, _, path = run.partition("=")
-        robots.setdefault(name, {})["run"] = summarise_run(Path(path))
-    # Where only runs and picks are added, the machine is still the one on which the others were measured.
-    kept = {} if names else {key: before[key] for key in ("machine", "settings") if key in before}
-    return {**kept, "robots": robots}
+        robots.setdefault(path.stem, {}).update(measure_robot(path.stem, settings))
+    for run in settings.run:
+        name, _, directory = run.partition("=")
+        robots.setdefault(name, {})["run"] = summarise_run(Path(directory))
+    return {"robots": robots}
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_benchmark("robots", ("mujoco", "numpy"), __doc__, Settings, benchmark, report))

@@ -7,15 +7,12 @@ time).
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.base.errors import TandemError
 from service.base.types import StateArray
 from service.media.figures import column
 
@@ -32,18 +29,6 @@ _DIGITS = 5
 
 Run = dict[str, Any]
 Records = Sequence[dict[str, Any]]
-
-
-def read_run(path: Path) -> Run:
-    """A file that ``record_run.py`` made."""
-    try:
-        run = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise TandemError(f"cannot read {path}: {error}; make it with benchmarks/record_run.py") from error
-    found = run.get("format_version") if isinstance(run, dict) else None
-    if found != FORMAT_VERSION:
-        raise TandemError(f"{path}: format version {found!r}, this program reads {FORMAT_VERSION}; record the run anew")
-    return dict(run)
 
 
 def thin(records: Records, max_points: int = MAX_POINTS) -> dict[str, list[float | None]]:

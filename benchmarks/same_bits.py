@@ -1,6 +1,6 @@
 """Whether two commits learn the same bits: small trainings with the code of both, compared number by number.
 
-    python -m benchmarks.same_bits --old 4dacdca --json same_bits.json
+    python -m benchmarks.same_bits --old f0b7427 --json same_bits.json
 
 The trainings run on this machine with this Python, one after the other, on one thread each. Compared are all arrays and
 plain values of the last checkpoint, the goals, and all metrics but ``time/*``. The exit code is 1 if anything differs
@@ -9,8 +9,8 @@ or a training fails. To see that it finds a difference, change one number of thi
     sed -i 's/^DECAY = 0.95$/DECAY = 0.951/' service/generator/difficulty.py
     python -m benchmarks.same_bits --only self-play
 
-``ROWS`` says what is run: where a command has another name in the new tree, its row gets a second one. Names of what is
-compared are mapped in ``RENAMED``.
+``ROWS`` says what is run, by commands that both commits take. What 4dacdca learned was compared by this program of
+f0b7427, which knew the names of before.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from typing import Any
 from safetensors import safe_open
 
 from benchmarks.compare_commits import full_name, worktree
-from benchmarks.measuring import ROOT, parser_of, run_benchmark
+from benchmarks.measuring import ROOT, run_benchmark
 from benchmarks.processes import descendants
 from benchmarks.report.markdown import table
 from benchmarks.training_process import Records, environment, scratch
@@ -40,18 +40,9 @@ from service.base.errors import TandemError
 
 PACKAGES = ("mujoco", "numpy", "torch")
 WORKTREE = "worktree"
-RENAMED: Mapping[str, str | None] = {
-    "checkpoint/learner/steady_bob/": "checkpoint/learner/bob_ema/",
-    "header/meta/loop/": "header/meta/state/random/",
-    **{f"header/meta/{name}": f"header/meta/state/{name}" for name in ("next_incarnation", "num_broken", "rng")},
-    "header/meta/teacher_observed": "header/meta/state/teacher_observed",
-}
-"""Beginnings of names in the old tree, and how they begin in the new one; None: it has no such thing, on purpose.
-
-Names are ``checkpoint/ARRAY``, ``header/KEY`` for the plain values beside the arrays, and ``FILE.jsonl/METRIC``."""
 NOT_LEARNED = frozenset({"config", "format_version", "records", "run", "sha256", "wall_s"})
 """Keys of those plain values that say how, when and where; they may differ."""
-METRICS, GOALS = "metrics.jsonl", "goals.jsonl"
+METRICS, GOALS, CHECKPOINTS = "metrics.jsonl", "goals.jsonl", "checkpoints"
 NUM_SHOWN = 4
 _LOOK_S = 0.005
 Values = list[tuple[int, object]]
@@ -63,18 +54,10 @@ class Row:
     """A training, by the arguments of ``tandem``."""
 
     name: str
-    old: str
-    """In the old tree. ``{run}`` stands for the run directory, ``{registry}`` for a registry without versions."""
-    new: str = ""
-    """In the new tree; empty: the same."""
+    command: str
+    """``{run}`` stands for the run directory, ``{registry}`` for a registry without versions."""
     killed_after: int = 0
     """Iteration of the checkpoint from which it is resumed after a kill -9; 0: it is not killed."""
-    checkpoints: tuple[str, str] = ("checkpoints", "checkpoints")
-    """Where the run directory has them, in the old tree and in the new one."""
-    renamed: Mapping[str, str | None] = field(default_factory=dict)
-    """As ``RENAMED``, of this row alone."""
-    added: tuple[str, ...] = ()
-    """Beginnings of names that only the new tree has, on purpose."""
     late: tuple[str, ...] = ()
     """Beginnings of metrics that come with the next record there is: their values count, not where they are."""
 
@@ -96,18 +79,10 @@ _SKILLS = (
     f"{_PRETRAIN} --set run.total_env_steps=9600 --set run.evaluation_interval=3 --set skills.sac.num_worlds=32"
     " --set skills.sac.learning_starts=1600 --set skills.replay_steps=6400"
 )
-_WALL = (
-    "downstream train --task wall --primitives panda-cube@champion --run-dir {run} --registry {registry}"
-    " --steps 12800 --episodes 20 --threads 1 --quiet"
-)
 _TASK = (
     "train wall --primitives panda-cube@champion --run-dir {run} --registry {registry} --quiet"
     " --set run.total_env_steps=12800 --set run.final_episodes=20 --set run.num_threads=1"
 )
-_TASK_RENAMED: Mapping[str, str | None] = {
-    **{f"checkpoint/{part}/": f"checkpoint/loop/{part}/" for part in ("learner", "replay", "worlds")},
-    "header/meta/curve": None,  # it is in the metrics
-}
 _LEARNERS = ("ours", "ours-her", "ours-residual-her", *(f"scratch-{net}" for net in ("monolithic", "mcp")))
 _LEARNERS += tuple(f"scratch-{net}-her" for net in ("monolithic", "mcp"))
 ROWS = (
@@ -115,16 +90,7 @@ ROWS = (
     Row("self-play-ray", _RAY, killed_after=12, late=("evaluation/",)),  # its actor evaluates beside the updates
     Row("distillation", _ROBUST),
     *(Row(method, f"{_SKILLS} --method {method}") for method in ("lsd", "metra", "dads", "diayn")),
-    *(
-        Row(
-            f"wall-{method}",
-            f"{_WALL} --method {method}",
-            f"{_TASK} --method {method}",
-            renamed=_TASK_RENAMED,
-            added=("checkpoint/policy/",),
-        )
-        for method in _LEARNERS
-    ),
+    *(Row(f"wall-{method}", f"{_TASK} --method {method}") for method in _LEARNERS),
 )
 
 
@@ -132,7 +98,7 @@ ROWS = (
 class Settings:
     """What is compared."""
 
-    old: str = "4dacdca"
+    old: str = "HEAD"
     """A commit."""
     new: str = WORKTREE
     """A commit, or this checkout as it is."""
@@ -145,10 +111,7 @@ class Settings:
 
 def compare_runs(old: Path, new: Path, row: Row) -> dict[str, Any]:
     """Compare what two run directories of a row hold: how much that was, and the names of what differs."""
-    before, after = _renamed(read_run(old, row, 0), {**RENAMED, **row.renamed}), read_run(new, row, 1)
-    after = {
-        name: values for name, values in after.items() if name in before or not name.startswith(row.added or ("\0",))
-    }
+    before, after = read_run(old, row), read_run(new, row)
     names = before.keys() & after.keys()
     differing = [
         (_first_difference(before.get(name, []), after.get(name, [])), name)
@@ -171,14 +134,17 @@ def _first_difference(one: Values, other: Values) -> int:
 def newest_checkpoint(directory: Path) -> Path:
     """The last file of the last process."""
     if not (files := sorted(directory.glob("*.safetensors"))):
-        raise TandemError(f"no checkpoint in {directory}; name in the row where its tree has them")
+        raise TandemError(f"no checkpoint in {directory}")
     return files[-1]
 
 
-def read_run(run: Path, row: Row, side: int) -> dict[str, Values]:
-    """Everything that is compared, by name."""
+def read_run(run: Path, row: Row) -> dict[str, Values]:
+    """Everything that is compared, by name.
+
+    Names are ``checkpoint/ARRAY``, ``header/KEY`` for the plain values beside the arrays, and ``FILE.jsonl/METRIC``.
+    """
     found: dict[str, Values] = {}
-    with safe_open(newest_checkpoint(run / row.checkpoints[side]), "numpy") as opened:
+    with safe_open(newest_checkpoint(run / CHECKPOINTS), "numpy") as opened:
         for name in opened.keys():  # noqa: SIM118
             array = opened.get_tensor(name)
             found[f"checkpoint/{name}"] = [(0, (array.dtype.str, array.shape, array.tobytes()))]
@@ -205,27 +171,17 @@ def _leaves(name: str, value: Any) -> Iterator[tuple[str, str]]:
             yield from _leaves(f"{name}/{key}", each)
 
 
-def _renamed(things: Mapping[str, Values], renamed: Mapping[str, str | None]) -> dict[str, Values]:
-    """What the old tree has, by the names of the new one."""
-    found = {}
-    for name, thing in things.items():
-        begin = max((begin for begin in renamed if name.startswith(begin)), key=len, default="")
-        if (instead := renamed.get(begin, "")) is not None:
-            found[instead + name.removeprefix(begin)] = thing
-    return found
-
-
 # --- running ----------------------------------------------------------------------------------------------------------
 
 
-def train(row: Row, side: int, tree: Path, home: Path) -> Path:
-    """Run a row with the code of a checkout, 0 the old and 1 the new one; its run directory."""
+def train(row: Row, tree: Path, home: Path) -> Path:
+    """Run a row with the code of a checkout; its run directory."""
     run = home / "runs" / row.name
-    command = shlex.split((row.old, row.new or row.old)[side].format(run=run, registry=home / "registry"))
+    command = shlex.split(row.command.format(run=run, registry=home / "registry"))
     if row.killed_after:
         records = Records(run / METRICS)
         _run(command, tree, home, lambda: any(each["iteration"] > row.killed_after for each in records.new()))
-        newest = newest_checkpoint(run / row.checkpoints[side])
+        newest = newest_checkpoint(run / CHECKPOINTS)
         if not newest.stem.endswith(f"{row.killed_after:08d}"):
             raise TandemError(f"killed too late, after {newest.name} was saved; try again when less else runs here")
         command.append("--resume")
@@ -269,8 +225,8 @@ def benchmark(settings: Settings) -> dict[str, Any]:
         for name, row in chosen.items():
             begun = time.monotonic()
             try:
-                runs = [train(row, side, tree, home / str(side)) for side, tree in enumerate((old, new))]
-                rows[name] = compare_runs(runs[0], runs[1], row)
+                before, after = train(row, old, home / "old"), train(row, new, home / "new")
+                rows[name] = compare_runs(before, after, row)
             except (TandemError, OSError) as error:  # other rows may say more
                 rows[name] = {"num_arrays": 0, "num_records": 0, "differing": [f"failed: {error}"]}
             rows[name]["seconds"] = round(time.monotonic() - begun, 1)
@@ -289,14 +245,10 @@ def report(result: dict[str, Any]) -> str:
     return table(("", "arrays compared", "records compared", "differing", "seconds"), cells)
 
 
-def main() -> int:
-    """Parse the command line, run, compare, print; 1 where anything differs."""
-    given = parser_of(__doc__, Settings()).parse_args()
-    return run_benchmark(
-        "same_bits", PACKAGES, given, Settings, benchmark, report,
-        failed=lambda result: any(row["differing"] for row in result["rows"].values()),
-    )  # fmt: skip
+def differs(result: dict[str, Any]) -> bool:
+    """Whether anything does."""
+    return any(row["differing"] for row in result["rows"].values())
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_benchmark("same_bits", PACKAGES, __doc__, Settings, benchmark, report, differs))

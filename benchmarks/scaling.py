@@ -1,6 +1,6 @@
 """Scaling of a run on Ray, measured on one box.
 
-    python -m benchmarks.scaling --run-dir runs/cube --json docs/results/scaling_box.json
+    python -m benchmarks.scaling runs/cube --json docs/results/scaling_box.json
 
 Env steps a second of a trained run with 1, 2, ... rollout actors, and with one that has a thread for every core, and
 the CPU time of every process. What ``docs/scaling.md`` says beyond one box was computed from ``scaling.json``.
@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measuring import parser_of, run_benchmark
-from benchmarks.report.scaling import box_block
+from benchmarks.measuring import run_benchmark
+from benchmarks.report.markdown import commit, percent, table
 from benchmarks.training_process import (
     ENDLESS,
     PLAIN,
@@ -26,6 +27,7 @@ from benchmarks.training_process import (
     overrides,
     scratch,
 )  # fmt: skip
+from service.config.self_play import SelfPlayConfig
 from service.store.run_directory import RunDirectory
 
 PACKAGES = ("ray", "redis", "mujoco", "numpy", "torch")
@@ -33,8 +35,10 @@ PACKAGES = ("ray", "redis", "mujoco", "numpy", "torch")
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Amount of what is measured."""
+    """What is measured."""
 
+    run_dir: str
+    """A run to go on from."""
     max_actors: int = os.cpu_count() or 1
     """Most actors on this box."""
     num_iterations: int = 25
@@ -53,44 +57,64 @@ def measure_run(
     return measured
 
 
-def benchmark(source: RunDirectory, settings: Settings) -> dict[str, Any]:
+def benchmark(settings: Settings) -> dict[str, Any]:
     """Everything, in directories that are deleted at the end."""
+    source = RunDirectory(Path(settings.run_dir))
     ways = {str(num): (num, 1) for num in range(1, settings.max_actors + 1)}
+    config = source.read_config()
+    assert isinstance(config, SelfPlayConfig)
     ways[f"1, of {settings.max_actors} threads"] = (1, settings.max_actors)
     found = {}
     with scratch() as home:
         for name, (num_actors, num_threads) in ways.items():
-            found[name] = box(measure_run(source, home, settings.num_iterations, num_actors, num_threads))
+            measured = measure_run(source, home, settings.num_iterations, num_actors, num_threads)
+            found[name] = box(measured, num_actors, -(-config.game.num_worlds // num_actors))
             print(f"{name} actors: {found[name]['env_steps_per_s']:,.0f} env steps/s", flush=True)
     return {"one_box": found}
 
 
-def box(each: Measured) -> dict[str, Any]:
-    """A measurement, for JSON."""
+def box(measured: Measured, num_actors: int, num_worlds: int) -> dict[str, Any]:
+    """A measurement of some actors with ``num_worlds`` each, for JSON.
+
+    The learner is idle while there is no update, an actor while it plays no round; evaluations, which actors make too,
+    count as idle.
+    """
+    rows, wall_s = measured.rows[1:], measured.wall_s
+    rollouts = [row.get("actor/num_rollouts", 1.0) for row in rows]
+    played_s = sum(row.get("time/play_s", 0.0) * num for row, num in zip(rows, rollouts, strict=True))
+    learned_s = sum(row.get("time/learn_s", 0.0) for row in rows)
+    roles = sorted(measured.role_cpu_s.items())
     return {
-        "env_steps_per_s": each.num_steps / each.wall_s,
-        "iteration_s": each.wall_s / each.num_iterations,
-        "rollouts_per_iteration": each.num_rollouts / each.num_iterations,
-        "num_worlds": each.num_worlds,
-        "play_s": each.play_s,
-        "learn_s": each.learn_s,
-        "learner_idle_share": each.learner_idle_share,
-        "actor_idle_share": each.actor_idle_share,
-        "cores": {role: seconds / each.wall_s for role, seconds in sorted(each.role_cpu_s.items())},
-        "cpu_s_per_iteration": {role: value / each.num_iterations for role, value in sorted(each.role_cpu_s.items())},
+        "env_steps_per_s": measured.sample.steps_per_s,
+        "iteration_s": wall_s / len(rows),
+        "rollouts_per_iteration": sum(rollouts) / len(rows),
+        "num_worlds": num_worlds,
+        "play_s": played_s / sum(rollouts),
+        "learn_s": learned_s / len(rows),
+        "learner_idle_share": 1.0 - learned_s / wall_s,
+        "actor_idle_share": 1.0 - played_s / (num_actors * wall_s),
+        "cores": {role: seconds / wall_s for role, seconds in roles},
+        "cpu_s_per_iteration": {role: seconds / len(rows) for role, seconds in roles},
     }
 
 
-def main() -> int:
-    """Parse the command line, measure, print."""
-    parser = parser_of(__doc__, Settings())
-    parser.add_argument("--run-dir", type=Path, metavar="DIR", required=True, help="go on from this run")
-    given = parser.parse_args()
-    source = RunDirectory(given.run_dir)
-    return run_benchmark(
-        "scaling_box", PACKAGES, given, Settings, lambda settings: benchmark(source, settings), box_block
-    )
+def box_block(result: Mapping[str, Any]) -> str:
+    """One box, in Markdown, for ``docs/scaling.md``."""
+    rows = []
+    for num, each in result["one_box"].items():
+        spent = {role: 1e6 * cores / each["env_steps_per_s"] for role, cores in each["cores"].items()}
+        rows.append(
+            (num, f"{each['num_worlds']}", f"{each['env_steps_per_s']:,.0f}", f"{each['iteration_s']:.2f} s",
+             percent(each["learner_idle_share"]), percent(each["actor_idle_share"]),
+             f"{sum(each['cores'].values()):.2f} of {result['machine']['num_cpus']}",
+             f"{sum(spent.values()):.0f} us", f"{spent['actor']:.0f} us", f"{spent['learner']:.0f} us")
+        )  # fmt: skip
+    head = ("actors", "worlds of each", "env steps/s", "an iteration", "learner idle", "actors idle", "cores busy",
+            "CPU time of an env step", "in actors", "in the learner")  # fmt: skip
+    where = result["machine"]
+    words = f"{where['cpu']}, {where['num_cpus']} cores, {commit(where['git_commit'])}, {where['time'][:10]}."
+    return f"{words}\n\n{table(head, rows)}"
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_benchmark("scaling_box", PACKAGES, __doc__, Settings, benchmark, box_block))

@@ -13,13 +13,12 @@ import argparse
 import json
 import math
 import statistics
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measuring import RECIPE_FILE, machine, write_json
+from benchmarks.measuring import RECIPE_FILE, machine, one_line_errors, write_json
 from benchmarks.processes import cpu_s_by_role
 from benchmarks.training_process import Training, overrides, scratch
 from service.base.errors import TandemError
@@ -33,16 +32,14 @@ SUCCESS = "evaluation/mixed_success_last"
 PACKAGES = ("mujoco", "numpy", "torch")
 
 
-def first_in_a_row(rates: Sequence[float], share: float = SHARE, num: int = NUM_IN_A_ROW) -> int | None:
-    """Index of the first of ``num`` neighbours that all reach ``share``; None if there are none."""
-    for index in range(len(rates) - num + 1):
-        if min(rates[index : index + num]) >= share:
-            return index
-    return None
+def first_in_a_row(rates: Sequence[float]) -> int | None:
+    """Index of the first of three neighbours that all reach the share; None if there are none."""
+    starts = range(len(rates) - NUM_IN_A_ROW + 1)
+    return next((index for index in starts if min(rates[index : index + NUM_IN_A_ROW]) >= SHARE), None)
 
 
-def run_seed(config: Path, settings: Sequence[str], seed: int, max_env_steps: int, share: float) -> dict[str, Any]:
-    """Run one seed until it is there, or to ``max_env_steps``; for JSON."""
+def run_seed(config: Path, settings: Sequence[str], seed: int, max_env_steps: int) -> dict[str, Any]:
+    """Run one seed of a recipe until it is there, or to ``max_env_steps``; for JSON."""
     budget = overrides({"seed": seed, "run.total_env_steps": max_env_steps})
     given = [word for each in settings for word in ("--set", each)]
     points: list[dict[str, float]] = []
@@ -56,7 +53,7 @@ def run_seed(config: Path, settings: Sequence[str], seed: int, max_env_steps: in
                 seen_s, cpu_s = time.monotonic() - start_s, sum(cpu_s_by_role(training.pid).values())
                 times = {"wall_s": seen_s, "cpu_s": cpu_s}
                 points += [_point(row) | times for row in rows if SUCCESS in row]
-                found = first_in_a_row([each["success"] for each in points], share)
+                found = first_in_a_row([each["success"] for each in points])
                 if rows[-1]["env_steps"] >= max_env_steps:
                     break
     there = points[found] if found is not None else None
@@ -85,46 +82,41 @@ def report(result: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@one_line_errors
+def main() -> int:
     """Parse the command line, measure, print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
-    parser.add_argument("--config", type=Path, default=RECIPE_FILE, metavar="FILE")
     parser.add_argument("--set", action="append", default=[], metavar="A.B=C", help="override; repeatable")
     parser.add_argument("--seeds", default="0-4", metavar="0,1,2|0-4", help="default: %(default)s")
-    parser.add_argument("--share", type=float, default=SHARE, help="default: %(default)s")
     parser.add_argument("--max-env-steps", type=int, default=12_000_000, help="default: %(default)s")
     parser.add_argument("--json", type=Path, required=True, metavar="FILE", help="results; seeds it has are not run")
-    given = parser.parse_args(arguments)
-    try:
-        config = load_config(given.config, given.set)
-        assert isinstance(config, SelfPlayConfig)
-        settings = {
-            "config": given.config.name,
-            "set": given.set,
-            "num_worlds": config.game.num_worlds,
-            "share": given.share,
-            "recipe": config.model_dump(mode="json"),
-        }
-        result: dict[str, Any] = {"benchmark": "time_to_skill", "settings": settings, "runs": []}
-        if given.json.exists():
-            result = json.loads(given.json.read_text(encoding="utf-8"))
-            if result["settings"] != settings:
-                before = result["settings"]
-                named = ", ".join(key for key, value in settings.items() if before.get(key) != value)
-                raise TandemError(f"{given.json}: its seeds had something else as {named}; name another file")
-        budget = given.max_env_steps
-        done = {run["seed"] for run in result["runs"] if run["reached"] or run["max_env_steps"] >= budget}
-        for seed in parse_seeds(given.seeds):
-            if seed not in done:
-                where = machine(*PACKAGES)
-                run = run_seed(given.config, given.set, seed, budget, given.share)
-                others = [each for each in result["runs"] if each["seed"] != seed]
-                result["runs"] = sorted([*others, run | {"machine": where}], key=lambda each: each["seed"])
-                write_json(given.json, result)
-                print(report(result), flush=True)
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    given = parser.parse_args()
+    config = load_config(RECIPE_FILE, given.set)
+    assert isinstance(config, SelfPlayConfig)
+    settings = {
+        "config": RECIPE_FILE.name,
+        "set": given.set,
+        "num_worlds": config.game.num_worlds,
+        "share": SHARE,
+        "recipe": config.model_dump(mode="json"),
+    }
+    result: dict[str, Any] = {"benchmark": "time_to_skill", "settings": settings, "runs": []}
+    if given.json.exists():
+        result = json.loads(given.json.read_text(encoding="utf-8"))
+        if result["settings"] != settings:
+            before = result["settings"]
+            named = ", ".join(key for key, value in settings.items() if before.get(key) != value)
+            raise TandemError(f"{given.json}: its seeds had something else as {named}; name another file")
+    budget = given.max_env_steps
+    done = {run["seed"] for run in result["runs"] if run["reached"] or run["max_env_steps"] >= budget}
+    for seed in parse_seeds(given.seeds):
+        if seed not in done:
+            where = machine(*PACKAGES)
+            run = run_seed(RECIPE_FILE, given.set, seed, budget)
+            others = [each for each in result["runs"] if each["seed"] != seed]
+            result["runs"] = sorted([*others, run | {"machine": where}], key=lambda each: each["seed"])
+            write_json(given.json, result)
+            print(report(result), flush=True)
     print(report(result))
     return 0
 

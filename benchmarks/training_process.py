@@ -11,7 +11,6 @@ import secrets
 import shutil
 import signal
 import socket
-import statistics
 import subprocess
 import sys
 import time
@@ -25,11 +24,11 @@ from tempfile import mkdtemp
 from types import MappingProxyType
 from typing import Any, Literal, Self, TypeVar
 
-import yaml
+import psutil
 from pydantic import ValidationError
 
 from benchmarks.measuring import ROOT, Sample
-from benchmarks.processes import cpu_s_by_role, descendants, is_running
+from benchmarks.processes import cpu_s_by_role
 from service.base.errors import StoreError, TandemError
 from service.store.checkpoints import CheckpointStore
 from service.store.disk_reader import DiskReader
@@ -40,11 +39,14 @@ from service.store.run_history import FILE as RUN_FILE
 ENDLESS = {"run.total_env_steps": 1_000_000_000_000}
 PLAIN = {"run.checkpoint_interval": 1_000_000_000, "run.evaluation_interval": 0}
 """Neither evaluations nor checkpoints."""
+NAME = "run"
+"""Of the run directory, below ``runs`` of its home."""
 NUM_WARMUP_ITERATIONS = 4
 """After a start, before it is measured: by then the learner and all actors are busy."""
 START_S = 240.0
 """Until the first iteration, on a machine that may be busy."""
-STOP_S = 60.0
+STOP_S, LEFT_S = 60.0, 5.0
+"""Until a run has ended, and then all that it started; what is left is killed."""
 _LOOK_S = 0.005
 _DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 _Answer = TypeVar("_Answer")
@@ -56,7 +58,6 @@ class Training:
     Args:
         home: directory for its run, its registry and Ray's files; its path has to be short.
         arguments: of ``tandem pretrain``, besides runtime, run directory and status.
-        name: of the run directory.
         runtime: which runner; ``ray`` has a status service.
         tree: checkout whose code runs.
         num_cores: that its Ray believes to have; None: those there are.
@@ -68,13 +69,12 @@ class Training:
         home: Path,
         arguments: Sequence[str],
         *,
-        name: str = "run",
         runtime: Literal["local", "ray"] = "ray",
         tree: Path = ROOT,
         num_cores: int | None = None,
         variables: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        self.name, self.directory, self.log_file = name, RunDirectory(home / "runs" / name), home / f"{name}.log"
+        self.directory, self.log_file = RunDirectory(home / "runs" / NAME), home / f"{NAME}.log"
         self.address = ("127.0.0.1", _free_port())
         """Host and port of the status service."""
         home.mkdir(parents=True, exist_ok=True)
@@ -123,9 +123,9 @@ class Training:
     def status(self) -> RunStatus | None:
         """The run's status by its status service, else as one for its directory has it; None before there is one."""
         try:
-            if told := self.get(f"/v1/runs/{self.name}", 2.0):
+            if told := self.get(f"/v1/runs/{NAME}", 2.0):
                 return RunStatus.model_validate_json(told)
-            return self._reader.run(self.name)
+            return self._reader.run(NAME)
         except (StoreError, ValidationError):
             return None
 
@@ -146,15 +146,16 @@ class Training:
     def stop(self) -> None:
         """End the run as ``ray job stop`` does: SIGTERM, which saves; what is left after a minute is killed."""
         if self.ended is None:
-            before = descendants(self.pid)
+            below = psutil.Process(self.pid).children(recursive=True)
             self._process.send_signal(signal.SIGTERM)
             try:
                 self._process.wait(STOP_S)
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
-            for pid in before:
-                _end(pid)
+            for left in psutil.wait_procs(below, LEFT_S)[1]:
+                with suppress(psutil.NoSuchProcess):
+                    left.kill()
 
     def last_words(self) -> str:
         """The last line of its log."""
@@ -187,36 +188,19 @@ class Records:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Costs of some iterations of a run."""
+    """Some iterations of a run."""
 
-    num_steps: int
+    rows: Sequence[Mapping[str, float]]
+    """Their records, and before them the last one that is not measured."""
     wall_s: float
-    num_iterations: int
-    num_rollouts: int
-    num_actors: int
-    num_worlds: int
-    """Worlds of each actor."""
-    play_s: float
-    """Mean duration of a round; 0 where play and learning share a process."""
-    learn_s: float
-    """Mean duration of an update."""
-    role_cpu_s: dict[str, float]
+    role_cpu_s: Mapping[str, float]
     """CPU seconds by role of process, several of one role together."""
 
     @property
     def sample(self) -> Sample:
-        """Its env steps and times."""
-        return Sample(self.num_steps, self.wall_s, sum(self.role_cpu_s.values()))
-
-    @property
-    def learner_idle_share(self) -> float:
-        """Share of the wall time without an update."""
-        return 1.0 - self.num_iterations * self.learn_s / self.wall_s
-
-    @property
-    def actor_idle_share(self) -> float:
-        """Share of the actors' wall time without a round; evaluations, which actors make too, count as idle."""
-        return 1.0 - self.num_rollouts * self.play_s / (self.num_actors * self.wall_s)
+        """Env steps and times."""
+        num_steps = self.rows[-1]["env_steps"] - self.rows[0]["env_steps"]
+        return Sample(int(num_steps), self.wall_s, sum(self.role_cpu_s.values()))
 
 
 def measure_training(
@@ -238,37 +222,7 @@ def measure_training(
     training.stop()
     (num_before, first_s, before), (_, last_s, after) = marks
     role_cpu_s = {role: seconds - before.get(role, 0.0) for role, seconds in after.items()}
-    num_worlds = _num_worlds(training.directory)
-    return summarise_rows(rows, num_before, last_s - first_s, role_cpu_s, num_actors, -(-num_worlds // num_actors))
-
-
-def _num_worlds(directory: RunDirectory) -> int:
-    """Worlds of a run, which may be one of another version."""
-    return int(yaml.safe_load(directory.config_file.read_text(encoding="utf-8"))["game"]["num_worlds"])
-
-
-def summarise_rows(
-    rows: Sequence[Mapping[str, float]], num_before: int, wall_s: float, role_cpu_s: Mapping[str, float],
-    num_actors: int, num_worlds: int,
-) -> Measured:  # fmt: skip
-    """Costs of the records after the first ``num_before``, at least 1, which took ``wall_s`` and ``role_cpu_s``."""
-    measured = rows[num_before:]
-    rollouts = [row.get("actor/num_rollouts", 1.0) for row in measured]
-
-    def mean_of_rounds(key: str) -> float:
-        return sum(row.get(key, 0.0) * num for row, num in zip(measured, rollouts, strict=True)) / sum(rollouts)
-
-    return Measured(
-        num_steps=int(measured[-1]["env_steps"] - rows[num_before - 1]["env_steps"]),
-        wall_s=wall_s,
-        num_iterations=len(measured),
-        num_rollouts=int(sum(rollouts)),
-        num_actors=num_actors,
-        num_worlds=num_worlds,
-        play_s=mean_of_rounds("time/play_s"),
-        learn_s=statistics.fmean(row.get("time/learn_s", 0.0) for row in measured),
-        role_cpu_s=dict(role_cpu_s),
-    )
+    return Measured(rows[num_before - 1 :], last_s - first_s, role_cpu_s)
 
 
 def environment(home: Path, tree: Path = ROOT) -> dict[str, str]:
@@ -289,9 +243,9 @@ def scratch() -> Iterator[Path]:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def copy_run(source: RunDirectory, home: Path, name: str = "run") -> RunDirectory:
+def copy_run(source: RunDirectory, home: Path) -> RunDirectory:
     """Copy what a ``Training`` in ``home`` needs to go on from the newest checkpoint of ``source``."""
-    store, target = CheckpointStore(source.checkpoints, keep=1), RunDirectory(home / "runs" / name)
+    store, target = CheckpointStore(source.checkpoints, keep=1), RunDirectory(home / "runs" / NAME)
     if (newest := store.newest()) is None:
         raise TandemError(f"no run with a checkpoint in {source.path}; name one that has one")
     target.checkpoints.mkdir(parents=True)
@@ -305,16 +259,6 @@ def copy_run(source: RunDirectory, home: Path, name: str = "run") -> RunDirector
 def overrides(settings: Mapping[str, object]) -> list[str]:
     """``--set`` arguments of the command line."""
     return [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]
-
-
-def _end(pid: int) -> None:
-    """Kill what a stopped run left behind, after a moment to end by itself."""
-    for _ in range(100):
-        if not is_running(pid):
-            return
-        time.sleep(0.05)
-    with suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGKILL)
 
 
 def _free_port() -> int:

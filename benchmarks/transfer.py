@@ -15,10 +15,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from benchmarks.measuring import parser_of, run_benchmark
-from benchmarks.report.markdown import percent, table
+from benchmarks.measuring import run_benchmark
+from benchmarks.report.markdown import measured_on, percent, table
 from service.actors.evaluation import evaluate, wilson_interval
-from service.base.errors import RobotError, TandemError
+from service.base.errors import RobotError
 from service.base.types import BoolArray, StateArray
 from service.envs.sampling import draw_goals, draw_objects
 from service.registry.loading import Trained, load
@@ -54,8 +54,6 @@ class Settings:
     wall: str = ""
     """The same for Wall."""
     registry: str = "registry"
-    rows: str = ""
-    """Names of rows, with commas; all by default."""
     num_goals: int = 300
     num_steps: int = 50
     seed: int = 0
@@ -153,7 +151,8 @@ def calibrate_row(row: Row, settings: Settings) -> Calibration:
     backend = connect(_backend(row), world)
     try:
         assert backend.simulator is not None
-        backend.simulator.reset(_out_of_the_way(world.workspace.upper_m, world.rest_height_m))
+        x, y, _ = world.workspace.upper_m  # out of the way
+        backend.simulator.reset(np.array([x, y, world.rest_height_m]))
         return calibrate(row.backend, backend.robot, world, bridge_config(settings))
     finally:
         backend.close()
@@ -255,10 +254,6 @@ def _backend(row: Row) -> BackendConfig:
     return BackendConfig(backend=row.backend, parameters=dict(row.parameters), disturbance=row.disturbance)
 
 
-def _out_of_the_way(upper_m: Sequence[float], height_m: float) -> StateArray:
-    return np.array([upper_m[0], upper_m[1], height_m])
-
-
 def summarise(played: Sequence[Played]) -> dict[str, Any]:
     """Rates of a row, for JSON."""
     num = len(played)
@@ -277,10 +272,7 @@ def summarise(played: Sequence[Played]) -> dict[str, Any]:
 
 def benchmark(settings: Settings) -> dict[str, Any]:
     """Everything measured, for JSON."""
-    names = [name for name in settings.rows.split(",") if name] or list(ROWS)
-    if unknown := [name for name in names if name not in ROWS]:
-        raise TandemError(f"--rows: no row {unknown[0]!r}; choose of {', '.join(ROWS)}")
-    names = [name for name in names if getattr(settings, ROWS[name].policy)]
+    names = [name for name, row in ROWS.items() if getattr(settings, row.policy)]
     policy = for_robot(load(settings.policy, settings.registry))
     rows: dict[str, Any] = {}
     for name in names:
@@ -305,6 +297,7 @@ def benchmark(settings: Settings) -> dict[str, Any]:
         seed=settings.seed,
     )
     return {
+        "benchmark": settings.name,
         "policy": {"label": policy.label, "digest": policy.digest},
         "bridge": bridge_config(settings).model_dump(mode="json"),
         "engine": PyBulletParameters().model_dump(mode="json"),
@@ -313,20 +306,52 @@ def benchmark(settings: Settings) -> dict[str, Any]:
     }
 
 
-def report(result: dict[str, Any]) -> str:
-    """A result for people."""
-    cells = (
-        (name, *(percent(row[key], 1) for key in ("success_last", "success_ever", "tip_inside", "asked")))
-        for name, row in result["rows"].items()
+def transfer_table(result: Mapping[str, Any]) -> str:
+    """Success of every row that was measured, beside what was asked."""
+    rows = []
+    for name, row in ROWS.items():
+        if name not in result["rows"]:
+            rows.append((row.title, "", "", "", percent(row.asked), "not measured"))
+            continue
+        each = result["rows"][name]
+        last = f"{percent(each['success_last'], 1)} {_interval(each, 'last')}"
+        reached = "yes" if each["success_last"] >= row.asked else "no"
+        covered = ", ".join(percent(share) for share in each["calibration"]["covered_share"])
+        rows.append((row.title, last, percent(each["success_ever"], 1), covered, percent(row.asked), reached))
+    head = ("", "success at the last step", "ever", "covered a step, x, y, z", "asked", "reached")
+    return table(head, rows)
+
+
+def transfer_words(result: Mapping[str, Any]) -> str:
+    """What was played, the motion of the tip, the stops, and where it was measured."""
+    rows, settings = result["rows"], result["settings"]
+    num_goals = sorted({row["num_goals"] for row in rows.values()})
+    words = [
+        f"{result['policy']['label']}, {', '.join(map(str, num_goals))} goals a row, {settings['num_steps']} steps; "
+        "95 % Wilson intervals. In the nominal world of training and without the bridge it reaches "
+        f"{percent(result['nominal_world']['success_last'], 1)} of such goals."
+    ]
+    if LIMITED in rows:
+        each = rows[LIMITED]
+        words.append(
+            f"In the first row the set-points stay inside {SPEED_M_S:g} m/s and {ACCELERATION_M_S2:g} m/s2 in "
+            f"{percent(each['set_point_inside'], 1)} of steps and the tip itself in {percent(each['tip_inside'], 1)}: "
+            f"in {percent(each['free_tip_inside'], 2)} of those in which the arm touches nothing "
+            f"({percent(each['free'])} of all). Asked were 100 %, and {percent(LIMITED_SUCCESS)} success."
+        )
+    stops = sum(row["num_stops"] for row in rows.values())
+    words.append(f"The bridge's safety stopped {stops} of {sum(row['num_goals'] for row in rows.values())} goals.")
+    bridge = settings["set_points_per_step"], settings["max_speed_m_s"], settings["max_acceleration_m_s2"]
+    words.append(
+        "The bridge of all rows: {} set-points a step, at most {:g} m/s and {:g} m/s2, ".format(*bridge)
+        + f"a grip of at most {settings['grip_force_n']:g} N.{measured_on(result['machine'])}"
     )
-    return table(("row", "last", "ever", "tip inside limits", "asked"), cells)
+    return " ".join(words)
 
 
-def main() -> int:
-    """Parse the command line, measure, print, write."""
-    given = parser_of(__doc__, Settings()).parse_args()
-    return run_benchmark(given.name, PACKAGES, given, Settings, benchmark, report)
+def _interval(each: Mapping[str, Any], name: str) -> str:
+    return f"({percent(each[f'success_{name}_low'])} to {percent(each[f'success_{name}_high'])})"
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_benchmark("transfer", PACKAGES, __doc__, Settings, benchmark, transfer_table))

@@ -10,17 +10,15 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measuring import write_json
+from benchmarks.measuring import one_line_errors, write_json
 from benchmarks.report.results import FORMAT_VERSION, TRIAL, Result
 from service.actors.evaluation import DeterministicPolicy, IdlePolicy, evaluate, wilson_interval
 from service.base.errors import TandemError
 from service.base.jsonl import read_jsonl
-from service.base.types import Metrics
 from service.base.version import git_commit
 from service.config.load import parse_config
 from service.config.task import TaskConfig
@@ -28,7 +26,7 @@ from service.config.tree import apply_override
 from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
 from service.methods.task_evaluation import FINAL_SEED
 from service.methods.task_methods import find_method
-from service.registry.loading import Trained, load
+from service.registry.loading import load
 from service.runs.train import train
 from service.store.run_directory import RunDirectory
 
@@ -49,9 +47,7 @@ def trial_config(task: str, method: str, seed: int, primitives: str, settings: S
     return config.model_copy(update={"method": method})
 
 
-def run_trial(
-    config: TaskConfig, registry: Path, path: Path, on_iteration: Callable[[Metrics], None] = lambda metrics: None
-) -> Result:
+def run_trial(config: TaskConfig, registry: Path, path: Path) -> Result:
     """Learn in a run directory, or go on there, or play where nothing is learned; what is recorded."""
     begun = config.begin(registry, None)
     if not find_method(config.method).learns:
@@ -60,7 +56,7 @@ def run_trial(
     if directory.exists and directory.read_config() != begun:
         raise TandemError(f"{path} holds a run of another configuration; remove it, or name another directory")
     if (result := directory.read_result() if directory.exists else None) is None:
-        train(begun, directory, registry, resume=directory.exists, publish=False, on_iteration=on_iteration)
+        train(begun, directory, registry, resume=directory.exists, publish=False, on_iteration=lambda _: None)
         if (result := directory.read_result()) is None:
             raise TandemError(f"{path}: stopped before its end; the same command goes on from there")
     return _recorded(begun, registry, result, read_jsonl(directory.metrics_file))
@@ -86,17 +82,11 @@ def _play(config: TaskConfig, registry: Path) -> dict[str, Any]:
     return {"evaluation": evaluation, "env_steps": 0, "wall_s": 0.0, "made": made}
 
 
-def provenance(trained: Trained, method: str | None = None) -> dict[str, Any]:
-    """Primitives or skills and the world that a result is of, as the recorded files have them."""
-    env_steps = None if trained.manifest is None else trained.manifest.metrics.get("env_steps")
-    primitives = {"name": trained.name, "digest": trained.digest, "env_steps": env_steps}
-    takes = method is None or find_method(method).takes is not None
-    return {"primitives": primitives if takes else None, "world": trained.config.world.model_dump(mode="json")}
-
-
 def _recorded(config: TaskConfig, registry: Path, result: dict[str, Any], records: Sequence[dict[str, Any]]) -> Result:
     """The file of a trial from its configuration, its ``result.json`` and its metrics."""
-    run = config.run
+    run, trained = config.run, load(config.primitives, registry)
+    before = None if trained.manifest is None else trained.manifest.metrics.get("env_steps")
+    primitives = {"name": trained.name, "digest": trained.digest, "env_steps": before}
     settings = {
         "task": config.task,
         "method": config.method,
@@ -122,7 +112,8 @@ def _recorded(config: TaskConfig, registry: Path, result: dict[str, Any], record
     return {
         "format_version": FORMAT_VERSION,
         TRIAL: settings,
-        **provenance(load(config.primitives, registry), config.method),
+        "primitives": primitives if find_method(config.method).takes is not None else None,
+        "world": trained.config.world.model_dump(mode="json"),
         "evaluation": {"goals": find_task(config.task).goals, **result["evaluation"]},
         "made": {**result["made"], "num_threads": run.num_threads},
         **{key: result[key] for key in ("env_steps", "wall_s")},
@@ -130,6 +121,7 @@ def _recorded(config: TaskConfig, registry: Path, result: dict[str, Any], record
     }
 
 
+@one_line_errors
 def main() -> int:
     """Parse the command line, run and record what is not there yet."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -143,16 +135,12 @@ def main() -> int:
     add("--runs", type=Path, metavar="DIR", default=Path("runs"), help="of run directories (default: %(default)s)")
     add("--out", type=Path, metavar="FILE", required=True)
     given = parser.parse_args()
-    try:
-        if given.out.exists():
-            print(f"skipped, {given.out} is there")
-            return 0
-        config = trial_config(given.task, given.method, given.seed, given.primitives, given.settings)
-        result = run_trial(config, given.registry, given.runs / config.directory_name)
-        write_json(given.out, result)
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    if given.out.exists():
+        print(f"skipped, {given.out} is there")
+        return 0
+    config = trial_config(given.task, given.method, given.seed, given.primitives, given.settings)
+    result = run_trial(config, given.registry, given.runs / config.directory_name)
+    write_json(given.out, result)
     print(f"{given.out}: {result['evaluation']['success_last']:.1%} at the last step")
     return 0
 

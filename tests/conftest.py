@@ -34,6 +34,34 @@ os.environ |= {"RAY_prestart_worker_first_driver": "0"}  # no spare workers, a s
 # Else every call of CliRunner builds all commands anew: 30 ms, some thousand times.
 typer.testing._get_command = functools.cache(typer.testing._get_command)
 
+TESTS = Path(__file__).parent
+SLOW = (
+    "cluster", "status/test_page.py", "benchmarks", "runs/test_study.py", "test_benchmarks.py", "media",
+    "methods/test_task.py", "status/test_page_curves.py", "status/test_downstream.py", "runs/test_signals.py",
+    "envs/test_world.py", "test_package.py", "robot/play/test_server.py", "runs/test_reporting.py",
+    "methods/test_skill_learning.py", "runs/test_killed.py", "runs/test_pretrain.py", "export", "cli/test_main.py",
+    "status/test_nginx.py", "status/test_stream.py", "status/test_connections.py", "cli/test_tasks.py",
+    "status/test_openapi.py", "methods/test_skill_run.py", "test_docs_site.py", "cli/test_attacks.py",
+    "store/test_redis.py", "status/test_client.py", "test_ship_primitives.py",
+)  # fmt: skip
+"""Where tests start Ray, a browser, a server or a training of their own; the longest first."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark slow tests, and begin with them: so no process has a long one left when the others have ended."""
+    if missing := [each for each in SLOW if not (TESTS / each).exists()]:
+        raise pytest.UsageError(f"tests/conftest.py names slow tests that are not there: {', '.join(missing)}")
+
+    @functools.cache
+    def place(path: Path) -> int:
+        return next((index for index, each in enumerate(SLOW) if path.is_relative_to(TESTS / each)), len(SLOW))
+
+    for item in items:
+        if place(item.path) < len(SLOW):
+            item.add_marker("slow")
+    items.sort(key=lambda item: place(item.path))
+
 
 def pytest_collection_finish() -> None:
     """Leave what imports made out of garbage collection, which took a tenth of the time of many tests."""

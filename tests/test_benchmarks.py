@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,6 @@ import pytest
 
 from benchmarks import (
     compare_commits,
-    coverage,
     env_throughput,
     measuring,
     record_run,
@@ -18,7 +18,6 @@ from benchmarks import (
     time_to_skill,
 )
 from benchmarks.measuring import Sample
-from benchmarks.report.__main__ import PAGES, Report, begin, end
 from benchmarks.report.figures import quantiles
 from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
 from service.base.errors import TandemError
@@ -88,6 +87,37 @@ def test_json_has_plain_lists_on_one_line_and_reads_back():
         measuring.to_text({"a": float("nan")})
 
 
+@dataclass(frozen=True)
+class Some:
+    """Settings of every kind."""
+
+    many: tuple[str, ...]
+    one: int = 3
+    two_words: bool = False
+    repeated: tuple[str, ...] = ()
+
+
+def test_settings_come_from_the_command_line(monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "argv", ["some", "a", "b"])
+    assert measuring.read_settings(None, Some) == (Some(("a", "b")), None)
+    file = tmp_path / "out.json"
+    words = ["--one", "4", "--two-words", "--repeated", "x", "--repeated", "y", "--json", str(file)]
+    monkeypatch.setattr(sys, "argv", ["some", "a", *words])
+    assert measuring.read_settings(None, Some) == (Some(("a",), 4, True, ("x", "y")), file)
+
+
+def test_a_benchmark_writes_what_it_measured_and_may_fail(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(sys, "argv", ["some", "a", "--json", str(tmp_path / "out.json")])
+
+    def measured(settings):
+        return {"found": settings.one}
+
+    assert measuring.run_benchmark("some", (), None, Some, measured, str, lambda result: result["found"] == 3) == 1
+    written = json.loads((tmp_path / "out.json").read_text())
+    assert (written["benchmark"], written["found"], written["settings"]["many"]) == ("some", 3, ["a"])
+    assert "'found': 3" in capsys.readouterr().out
+
+
 # --- env throughput ---------------------------------------------------------------------------------------------------
 
 
@@ -118,7 +148,8 @@ def test_only_grasping_arms_lift_the_object():
 def test_without_panda_gym_one_line_says_how_to_get_it(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "panda_gym", None)
     monkeypatch.setattr(sys, "argv", ["env_throughput.py", "--num-worlds", "1"])
-    assert env_throughput.main() == 2
+    given = (env_throughput.Settings, env_throughput.benchmark, env_throughput.report)
+    assert measuring.run_benchmark("env_throughput", (), None, *given) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "make bench" in error
@@ -136,32 +167,42 @@ def test_panda_gym_plays_where_it_is_installed():
 def test_the_first_of_three_in_a_row():
     rates = [0.5, 0.9, 0.95, 0.8, 0.9, 0.91, 0.92, 0.99]
     assert time_to_skill.first_in_a_row(rates) == 4
-    assert time_to_skill.first_in_a_row(rates, share=0.91) == 5
     assert time_to_skill.first_in_a_row(rates[:6]) is None
     assert time_to_skill.first_in_a_row([]) is None
 
 
-def test_time_to_skill_stops_a_seed_that_is_there_and_skips_it_later(tmp_path, capsys):
+def test_a_seed_ends_when_it_is_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(time_to_skill, "SHARE", 0.0)
     evaluated = [f"run.evaluation_{name}" for name in ("interval=1", "episodes=2", "steps=2")]
     (tmp_path / "tiny.yaml").write_text(dump_config(load_config(None, [*TINY, *evaluated])))
-    command = ["--config", str(tmp_path / "tiny.yaml"), "--json", str(tmp_path / "out.json"), "--share", "0"]
-    assert time_to_skill.main([*command, "--seeds", "3"]) == 0
-    (run,) = json.loads((tmp_path / "out.json").read_text())["runs"]
+    run = time_to_skill.run_seed(tmp_path / "tiny.yaml", [], 3, 1_000_000)
     assert (run["seed"], run["reached"], run["at"]) == (3, True, run["curve"][0])
     assert len(run["curve"]) >= 3
     assert run["curve"][0]["wall_s"] <= run["curve"][2]["wall_s"]
-    assert "Median: " in capsys.readouterr().out
-    assert time_to_skill.main([*command, "--seeds", "3"]) == 0  # at once
-    before = json.loads((tmp_path / "out.json").read_text())
-    before["runs"][0] |= {"reached": False, "max_env_steps": 100}  # as if it had not been there within fewer
-    (tmp_path / "out.json").write_text(json.dumps(before))
-    assert time_to_skill.main([*command, "--seeds", "3"]) == 0
-    assert [each["reached"] for each in json.loads((tmp_path / "out.json").read_text())["runs"]] == [True]
-    assert time_to_skill.main([*command[:-1], "0.5", "--seeds", "3"]) == 2
-    assert "something else as share; name another file" in capsys.readouterr().err
-    (tmp_path / "tiny.yaml").write_text(dump_config(load_config(None, [*TINY, *evaluated, "game.bob_steps=3"])))
-    assert time_to_skill.main([*command, "--seeds", "4"]) == 2  # the file has the same name, and says something else
-    assert "something else as recipe; name another file" in capsys.readouterr().err
+
+
+def test_a_seed_that_was_there_is_not_run_again(tmp_path, monkeypatch, capsys):
+    file = tmp_path / "out.json"
+    asked = []
+
+    def run_seed(recipe, settings, seed, budget):
+        asked.append((seed, budget))
+        at = {"wall_s": 60.0, "cpu_s": 60.0, "env_steps": 1e6, "iteration": 9}
+        there = seed != 4
+        return {"seed": seed, "reached": there, "max_env_steps": budget, "at": at if there else None, "curve": [at]}
+
+    def command(*words):
+        monkeypatch.setattr(sys, "argv", ["time_to_skill", "--json", str(file), *words])
+        return time_to_skill.main()
+
+    monkeypatch.setattr(time_to_skill, "run_seed", run_seed)
+    assert command("--seeds", "3-4", "--max-env-steps", "100") == 0
+    assert command("--seeds", "2-4", "--max-env-steps", "200") == 0
+    assert asked == [(3, 100), (4, 100), (2, 200), (4, 200)]  # seed 4 was not there within fewer
+    assert [run["seed"] for run in json.loads(file.read_text())["runs"]] == [2, 3, 4]
+    assert "Median: 1.0 minutes" in capsys.readouterr().out
+    assert command("--set", "game.bob_steps=3") == 2
+    assert "something else as set, recipe; name another file" in capsys.readouterr().err
 
 
 # --- recorded runs ----------------------------------------------------------------------------------------------------
@@ -247,17 +288,6 @@ def test_a_recorded_run_is_small_and_whole(tmp_path):
     assert load_config().model_dump(mode="json") == record["config"]
 
 
-def test_other_files_are_not_runs(tmp_path):
-    for text, words in (
-        ("{", "cannot read"),
-        ('{"format_version": 9}', "format version 9"),
-        ("[]", "format version None"),
-    ):
-        (tmp_path / "run.json").write_text(text)
-        with pytest.raises(TandemError, match=words):
-            run_files.read_run(tmp_path / "run.json")
-
-
 def test_goals_are_counted_by_hand():
     rest = 0.025
     records = [
@@ -291,23 +321,23 @@ def test_quantiles_by_hand():
 
 
 def test_stages_are_the_nearest_snapshots():
-    assert coverage.pick_stages([0, 12, 31, 44, 60]) == {"beginning": 0, "middle": 31, "end": 60}
-    assert coverage.pick_stages({60: "b", 4: "a"}) == {"middle": 4, "end": 60}
-    assert coverage.pick_stages([60]) == {"end": 60}
+    assert record_run.pick_stages([0, 12, 31, 44, 60]) == {"beginning": 0, "middle": 31, "end": 60}
+    assert record_run.pick_stages({60: "b", 4: "a"}) == {"middle": 4, "end": 60}
+    assert record_run.pick_stages([60]) == {"end": 60}
 
 
 def test_coverage_is_measured_at_each_stage_beside_a_random_policy(config):
     untrained, other = (Learner(config.model_copy(update={"seed": seed})).weights().bob for seed in (0, 1))
     _, champion = Registry(BUNDLED).load("panda-cube@champion")
     bobs = {0: untrained, 500: champion, 900: other}
-    found = coverage.measure_coverage(bobs, config, num_sets=2, num_steps=24)
+    found = record_run.measure_coverage(bobs, config, num_sets=2, num_steps=12)
     assert {name: stage.get("env_steps") for name, stage in found["stages"].items()} == {
         "random policy": None, "beginning": 0, "middle": 500, "end": 900,
     }  # fmt: skip
     policies = [RandomPolicy(), *map(numpy_bob, bobs.values())]
     for policy, stage in zip(policies, found["stages"].values(), strict=True):
         paths = [
-            skill_trajectories(policy, config.world, num_skills=32, num_steps=24, seed=seed, num_threads=1)
+            skill_trajectories(policy, config.world, num_skills=32, num_steps=12, seed=seed, num_threads=1)
             for seed in (0, 1)
         ]
         assert stage["shares"] == [round(visited_share(each, config.world.workspace), 4) for each in paths]
@@ -319,7 +349,7 @@ def test_coverage_is_measured_at_each_stage_beside_a_random_policy(config):
 
 def test_a_monolithic_bob_has_no_coverage():
     config = load_config(None, [*TINY, "policy.monolithic_bob={hidden_sizes: [8]}"])
-    assert coverage.measure_coverage({5: Learner(config).weights().bob}, config, num_sets=1, num_steps=1) is None
+    assert record_run.measure_coverage({5: Learner(config).weights().bob}, config, num_sets=1, num_steps=1) is None
 
 
 def test_a_run_is_measured_from_its_snapshots_and_its_checkpoint(tmp_path, monkeypatch):
@@ -343,27 +373,6 @@ def test_a_run_is_measured_from_its_snapshots_and_its_checkpoint(tmp_path, monke
     assert (measured["coverage"][0], measured["coverage"][run.num_env_steps]) == (first, newest)
     assert set(measured["coverage"]) == set(read_stages(RunDirectory(tmp_path)))
     assert newest != first
-
-
-# --- the page ---------------------------------------------------------------------------------------------------------
-
-
-def _documents(path):
-    """A directory of documents whose pages have blocks and no words."""
-    (path / "results" / "runs").mkdir(parents=True)
-    for page, names in PAGES.items():
-        (path / page).write_text("\n".join(f"## {name}\n\n{begin(name)}\n{end(name)}\n" for name in names))
-    return path
-
-
-def test_a_page_without_markers_is_left_alone(tmp_path):
-    docs = _documents(tmp_path)
-    page = docs / "results" / "pretraining.md"
-    page.write_text(page.read_text().replace(end("coverage"), ""))
-    before = {path: path.read_bytes() for path in docs.rglob("*.md")}
-    with pytest.raises(TandemError, match="no markers for coverage"):
-        Report(docs).write()
-    assert {path: path.read_bytes() for path in docs.rglob("*.*")} == before
 
 
 # --- two commits ------------------------------------------------------------------------------------------------------
@@ -392,31 +401,23 @@ def test_a_commit_is_checked_out_for_as_long_as_it_is_needed(tmp_path):
             use("no-such-commit", tmp_path)
 
 
-def test_two_commits_are_measured_in_turn_from_the_same_checkpoint(config, tmp_path, monkeypatch):
-    """This checkout stands for both; its recipe is replaced by tiny games."""
-    (tmp_path / "tiny.yaml").write_text(dump_config(config))
-    source = compare_commits.train(ROOT, tmp_path / "trained", 100, tmp_path / "tiny.yaml")
-    steps = [json.loads(line)["env_steps"] for line in source.metrics_file.read_text().splitlines()]
-    assert steps[-1] >= 100
-    calls, measured = [], []
-    measure_commit = compare_commits.measure_commit
-    monkeypatch.setattr(compare_commits, "train", lambda tree, home, num, file: calls.append(("train", num)) or source)
+def test_two_commits_are_trained_and_then_measured_in_turn(tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(compare_commits, "train", lambda tree, home, num, file: calls.append(("train", tree, num)))
 
-    def measure(*arguments):
-        calls.append(("measure", arguments[-1]))
-        measured.append(measure_commit(*arguments))
-        return measured[-1]
+    def measure(tree, run, home, num):
+        calls.append(("measure", tree, num))
+        return Sample(len(calls), 1.0, 1.0)
 
     monkeypatch.setattr(compare_commits, "measure_commit", measure)
-    settings = compare_commits.Settings(300, num_pairs=1, num_iterations=7)
-    samples = compare_commits.compare({"a": ROOT, "b": ROOT}, tmp_path, settings)
-    assert calls == [("train", 300), ("train", 300), ("measure", 7), ("measure", 7)]
-    assert samples == {"a": [measured[0]], "b": [measured[1]]}
-    assert all(sample.num_steps > 0 and sample.cpu_s > 0.0 for sample in measured)
-    assert not (tmp_path / "runs" / "run").exists()
+    settings = compare_commits.Settings("", "", trained_steps=300, num_pairs=2, num_iterations=7)
+    one, other = ROOT / "one", ROOT / "other"
+    samples = compare_commits.compare({"a": one, "b": other}, tmp_path, settings)
+    measured = [("measure", one, 7), ("measure", other, 7)]
+    assert calls == [("train", one, 300), ("train", other, 300), *measured, *measured]
+    assert {name: [each.num_steps for each in row] for name, row in samples.items()} == {"a": [3, 5], "b": [4, 6]}
 
 
-def test_a_commit_is_not_compared_with_itself(monkeypatch):
-    monkeypatch.setattr(compare_commits, "full_name", lambda name: "0" * 40)
+def test_a_commit_is_not_compared_with_itself():
     with pytest.raises(TandemError, match="the same commit"):
-        compare_commits.benchmark("HEAD", "main", compare_commits.Settings())
+        compare_commits.benchmark(compare_commits.Settings("HEAD", "HEAD"))

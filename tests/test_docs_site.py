@@ -136,15 +136,6 @@ def test_there_are_commands_to_type():
     assert verbs == {"--version", "demo", "evaluate", "play", "render", "train", "serve"}
 
 
-def test_start_here_measures_what_comes_with_tandem(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (words,) = [words for words in commands(START) if "panda-cube@champion" in words and words[0] == "evaluate"]
-    assert words[-2:] == ["--episodes", "100"]
-    result = CliRunner().invoke(app, [*words[:-1], "4", "--json"])
-    assert result.exit_code == 0, result.output
-    assert '"num_episodes": 4' in result.stdout
-
-
 def test_start_heres_task_is_learned_measured_and_loaded(tmp_path, monkeypatch):
     """Its commands, in order, with a tiny run; then what downstream.md does with the result."""
     monkeypatch.chdir(tmp_path)

@@ -4,7 +4,6 @@ import json
 import os
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 import sysconfig
@@ -24,6 +23,7 @@ from service.registry.acting import acting_config
 from service.registry.bundled import BUNDLED
 from service.registry.registry import Registry
 from tests.registry.helpers import files_in
+from tools.wheel_in_empty_environment import build_wheel
 
 ROOT = Path(__file__).parents[1]
 LOAD = """
@@ -37,28 +37,20 @@ print(bob.label, Path(service.__file__).parents[1], sep="\\n")
 """
 
 
+def without_this_checkout():
+    """The environment of a process that has to find the installed wheel."""
+    return {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "TANDEM_REGISTRY")}
+
+
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
     """The place of packages in a new environment with the wheel of this checkout."""
     home = tmp_path_factory.mktemp("wheel")
-    source = home / "source"
-    for name in ("service", "configs"):
-        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}  # or it is there already
-    options = ("--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check")
-    subprocess.run(
-        [sys.executable, "-m", "pip", "wheel", *options, "--wheel-dir", home, source],
-        check=True,
-        timeout=600,
-        env=environment,
-    )
-    (wheel,) = home.glob("*.whl")
+    wheel = build_wheel(home)
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", home / "venv"], check=True, timeout=600)
     python = home / "venv" / "bin" / "python"
     install = (sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel)
-    subprocess.run(install, check=True, timeout=600, env=environment)
+    subprocess.run(install, check=True, timeout=600, env=without_this_checkout())
     (site,) = (home / "venv" / "lib").glob("python*/site-packages")
     (site / "others.pth").write_text(sysconfig.get_path("purelib"))  # what it depends on; that takes minutes to install
     return site
@@ -66,11 +58,9 @@ def installed(tmp_path_factory):
 
 def run(installed, directory, *arguments, program="python"):
     """A program of the environment with the wheel, in another directory."""
-    ours = {"PYTHONPATH", "TANDEM_REGISTRY", "VIRTUAL_ENV"}
-    environment = {key: value for key, value in os.environ.items() if key not in ours}
     result = subprocess.run(
         [installed.parents[2] / "bin" / program, *arguments],
-        cwd=directory, env=environment, capture_output=True, text=True, timeout=600,
+        cwd=directory, env=without_this_checkout(), capture_output=True, text=True, timeout=600,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
     return result.stdout
@@ -88,15 +78,10 @@ def test_what_a_missing_package_asks_for_needs_no_index(installed, tmp_path):
     assert said is not None
     pip = [sys.executable, "-m", "pip", "--python", installed.parents[2] / "bin" / "python"]
     options = ["--no-deps", "--no-index", "--disable-pip-version-check"]
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(
         [*pip, *shlex.split(said[0])[1:], *options],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
+        cwd=tmp_path, env=without_this_checkout(), capture_output=True, text=True, timeout=600,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert f"already satisfied: tandem-skills[play] in {installed}" in done.stdout
 
@@ -149,9 +134,8 @@ def test_the_recipes_and_robots_are_in_it(installed, tmp_path):
 SHORT_DEMO = """
 import functools, sys
 from service.actors import evaluation
-from service.media import artifacts
-artifacts.COVERAGE_STEPS = 2
-artifacts.video.write_video = lambda rounds, world, path: path
+from service.runs import train
+train.make_artifacts = lambda directory, registry: {}
 real = evaluation.evaluate
 evaluation.evaluate = lambda *all, **more: real(*all, **more | {"num_episodes": 2, "num_steps": 2})
 sys.argv = ["tandem", "demo", "--env-steps", "1"]

@@ -21,6 +21,10 @@ KEYS = {
     "user", "volumes",
 }  # fmt: skip
 """Keys of a service that are known here."""
+SHARED = {
+    "init": True, "cap_drop": ["ALL"], "security_opt": ["no-new-privileges:true"], "restart": "unless-stopped"
+}  # fmt: skip
+"""What every service has, and every container is given."""
 _VARIABLE = re.compile(r"\$(?:(?P<escaped>\$)|\{(?P<name>\w+)(?::(?P<how>[-?])(?P<rest>[^}]*))?\})")
 _SIZES = {"kb": 2**10, "mb": 2**20, "gb": 2**30, "k": 2**10, "m": 2**20, "g": 2**30}
 
@@ -70,11 +74,7 @@ class Service:
     memory_bytes: int | None
     shm_bytes: int
     stop_grace_s: float
-    init: bool
     read_only: bool
-    drops_capabilities: bool
-    no_new_privileges: bool
-    restarts: bool
     profiles: Sequence[str] = field(default_factory=tuple)
 
 
@@ -110,6 +110,8 @@ def read_variables(path: Path) -> dict[str, str]:
 def _service(name: str, tree: Mapping[str, Any], directory: Path, secrets: Mapping[str, str]) -> Service:
     if unknown := tree.keys() - KEYS:
         raise TandemError(f"service {name}: {', '.join(sorted(unknown))} is not known here; add it to {__name__}")
+    if differing := [key for key, value in SHARED.items() if tree.get(key) != value]:
+        raise TandemError(f"service {name}: {differing[0]} is not {SHARED[differing[0]]}, as of all others")
     deploy = tree.get("deploy", {})
     limits = deploy.get("resources", {}).get("limits", {})
     if tree.get("read_only") and tree.get("secrets"):
@@ -135,11 +137,7 @@ def _service(name: str, tree: Mapping[str, Any], directory: Path, secrets: Mappi
         memory_bytes=_bytes(limits["memory"]) if "memory" in limits else None,
         shm_bytes=_bytes(tree.get("shm_size", "64mb")),
         stop_grace_s=float(tree.get("stop_grace_period", "10s").removesuffix("s")),
-        init=tree.get("init", False),
         read_only=tree.get("read_only", False),
-        drops_capabilities=tree.get("cap_drop") == ["ALL"],
-        no_new_privileges="no-new-privileges:true" in tree.get("security_opt", []),
-        restarts=tree.get("restart") == "unless-stopped",
         profiles=tree.get("profiles", []),
     )
 

@@ -189,7 +189,7 @@ class Container:
     def status(self) -> dict[str, str]:
         """What the kernel says about its program: ``/proc/PID/status``."""
         children = Path(f"/proc/{self.pid}/task/{self.pid}/children").read_text().split()
-        text = Path(f"/proc/{children[0] if self.service.init else self.pid}/status").read_text()
+        text = Path(f"/proc/{children[0]}/status").read_text()
         return {key: value.strip() for key, _, value in (line.partition(":") for line in text.splitlines())}
 
     def _script(self) -> list[str]:
@@ -222,8 +222,7 @@ class Container:
                 f"mkdir {root}/sys/fs/cgroup/memory",
                 f"mount --bind -o ro {MEMORY}/tandem-deployed-{self.name} {root}/sys/fs/cgroup/memory",
             ]
-        if service.init:
-            lines += [f"install -m 755 {INIT} {root}/sbin/docker-init"]
+        lines += [f"install -m 755 {INIT} {root}/sbin/docker-init"]
         for name, value in service.secrets.items():
             place = f"{root}/run/secrets/{name}"
             lines += [f"printf %s {shlex.quote(value)} > {place}", f"chmod 444 {place}"]
@@ -232,7 +231,7 @@ class Container:
         lines += [f"mount -t tmpfs -o mode=1777,nosuid,nodev,noexec tmpfs {root}{place}" for place in service.tmpfs]
         if service.read_only:
             lines += [f"mount -o remount,ro {root}"]
-        command = [*(["/sbin/docker-init", "--"] if service.init else []), *self._command()]
+        command = ["/sbin/docker-init", "--", *self._command()]
         return [*lines, "exec " + shlex.join(["chroot", str(root), *self._inside(), *command])]
 
     def _mount(self, source: Path | str, target: str, mode: str) -> list[str]:
@@ -261,8 +260,7 @@ class Container:
         """The words before a command that give it the container's environment, directory, user and rights."""
         user, group, home = _account(self.service.user or self._image.user, self._image.root)
         variables = {"HOME": home, "HOSTNAME": self.name, **self._image.environment, **self.service.environment}
-        rights = ["--bounding-set=-all", "--inh-caps=-all"] * self.service.drops_capabilities
-        rights += ["--no-new-privs"] * self.service.no_new_privileges
+        rights = ["--bounding-set=-all", "--inh-caps=-all", "--no-new-privs"]
         return [
             *("env", "-i", "-C", self._image.directory, *(f"{key}={value}" for key, value in variables.items())),
             *("setpriv", f"--reuid={user}", f"--regid={group}", "--clear-groups", *rights),
@@ -335,7 +333,7 @@ class Containers:
             time.sleep(RESTART_S)
             with self._lock:
                 for each in self._all.values():
-                    if each.wanted and each.service.restarts and not each.runs:
+                    if each.wanted and not each.runs:
                         _log.info("%s has ended, and is started again", each.name)
                         try:
                             each.clear()

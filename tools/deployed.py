@@ -24,12 +24,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measuring import machine, write_json
+from benchmarks.measuring import machine, one_line_errors, write_json
 from service.base.errors import TandemError
 from tools.compose_services import read_services, read_variables
 from tools.containers import Containers, need_programs, remove_memory_groups, run
 from tools.deployed_checks import CHECKS, Deployment
-from tools.images import DEBIAN, ROOT, Store
+from tools.images import ROOT, Store
 
 PROGRAMS = ("buildah", "debootstrap", "dnsmasq", "ip", "nsenter", "setpriv", "socat", "tini-static", "unshare")
 SPACES = ("--mount", "--net", "--pid", "--fork", "--kill-child", "--mount-proc")
@@ -38,37 +38,29 @@ INSIDE = "TANDEM_DEPLOYED_INSIDE"
 _log = logging.getLogger("deployed")
 
 
+@one_line_errors
 def main() -> int:
     """Parse the command line; build; start again in namespaces of our own, and check there."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--home", type=Path, metavar="DIR", default=HOME, help="default: %(default)s")
     parser.add_argument("--wheels", type=Path, metavar="DIR", help="has a wheel of torch; default: torch's own index")
-    parser.add_argument("--debian", metavar="URL", default=DEBIAN, help="mirror; default: %(default)s")
-    parser.add_argument("--only", metavar="A,B", help="checks besides those that start everything; default: all")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the result")
     given = parser.parse_args()
-    only = given.only.split(",") if given.only else list(CHECKS)
-    if unknown := set(only) - set(CHECKS):
-        parser.error(f"--only {', '.join(sorted(unknown))}: no such check; there are {', '.join(CHECKS)}")
     logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     store = Store(given.home)
-    try:
-        if INSIDE in os.environ:
-            return check(store, Path(os.environ[INSIDE]), only, given.json)
-        return build_and_enter(store, given.wheels, given.debian)
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    if INSIDE in os.environ:
+        return check(store, Path(os.environ[INSIDE]), given.json)
+    return build_and_enter(store, given.wheels)
 
 
-def build_and_enter(store: Store, wheels: Path | None, debian: str) -> int:
+def build_and_enter(store: Store, wheels: Path | None) -> int:
     """Build the images, and start this program again in namespaces of its own; clean up behind it."""
     if os.geteuid() != 0:
         raise TandemError("needs root: it makes mounts, networks and users of containers")
     need_programs(PROGRAMS)
     begun_s = time.monotonic()
-    store.build(wheels, debian)
+    store.build(wheels)
     _log.info("the images are there after %.0f s", time.monotonic() - begun_s)
     with tempfile.TemporaryDirectory(prefix="tandem-deployed-", dir="/var/tmp") as home:
         command = ["unshare", *SPACES, sys.executable, "-m", "tools.deployed", *sys.argv[1:]]
@@ -79,14 +71,14 @@ def build_and_enter(store: Store, wheels: Path | None, debian: str) -> int:
             store.forget()
 
 
-def check(store: Store, home: Path, only: list[str], file: Path | None) -> int:
+def check(store: Store, home: Path, file: Path | None) -> int:
     """Make all checks in order, also after one has failed; 1 if one did."""
     shutil.copytree(ROOT / "deploy", home / "deploy", ignore=shutil.ignore_patterns(".env"))
     run(["sh", str(home / "deploy" / "compose" / "make-env.sh")])
     variables = read_variables(home / "deploy" / "compose" / ".env")
     services = read_services(home / "deploy" / "compose" / "compose.yaml", variables)
     deployment = Deployment(home, services, variables, Containers(home, store.images()))
-    results = [_make(name, each, deployment) for name, each in CHECKS.items() if name in ("starts", *only)]
+    results = [_make(name, each, deployment) for name, each in CHECKS.items()]
     deployment.down()
     if any(each["outcome"] == "failed" for each in results):
         kept = store.directory / "last-failure"

@@ -18,6 +18,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 import service
+from benchmarks.report.markdown import table
 from service.cli.main import app
 from service.config import Config, load_config
 from service.config.find import METHODS, find_class
@@ -258,9 +259,3 @@ def prose(text: str) -> str:
 def cell(text: str) -> str:
     """What may stand in a table."""
     return text.replace("|", r"\|")
-
-
-def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    """A table in Markdown."""
-    lines = [head, ("---",) * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

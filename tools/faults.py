@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
 
-from benchmarks.measuring import RECIPE_FILE, parser_of, run_benchmark
+from benchmarks.measuring import RECIPE_FILE, run_benchmark
 from benchmarks.processes import descendants
 from benchmarks.report.markdown import table
 from benchmarks.training_process import ENDLESS, Training, overrides, scratch
@@ -274,14 +274,10 @@ def _account(account: Mapping[str, Any] | None) -> str:
     return f"{account['num_counted']} counted, {account['num_refused']} came too late, {whole}"
 
 
-def main() -> int:
-    """Parse the command line, strike, print; 1 where a fault was missed."""
-    given = parser_of(__doc__, Settings()).parse_args()
-    return run_benchmark(
-        "faults", PACKAGES, given, Settings, benchmark, report,
-        failed=lambda result: not all(each["reached"] for each in result["faults"].values()),
-    )  # fmt: skip
+def missed(result: dict[str, Any]) -> bool:
+    """Whether a fault was not got over as it must be."""
+    return not all(each["reached"] for each in result["faults"].values())
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_benchmark("faults", PACKAGES, __doc__, Settings, benchmark, report, missed))

@@ -55,16 +55,15 @@ class Store:
         place = ["--root", str(directory / "store"), "--runroot", str(directory / "run")]
         self._buildah = ["buildah", *place, "--storage-driver", "overlay"]
 
-    def build(self, wheels: Path | None, debian: str) -> None:
+    def build(self, wheels: Path | None) -> None:
         """Build what is missing or has changed.
 
         Args:
             wheels: directory with a wheel of torch, in place of the index that the Dockerfile names.
-            debian: mirror of Debian.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         if run([*self._buildah, "inspect", "--type", "image", BASE], check=False).returncode != 0:
-            self._import_base(debian)
+            self._import_base()
         file = ROOT / "deploy" / "docker" / "Dockerfile"
         with _index_of(wheels) as url:
             given = [f"--build-arg=PYTHON={BASE}", *([f"--build-arg=TORCH_INDEX={url}"] if url else [])]
@@ -96,11 +95,11 @@ class Store:
     def _build(self, name: str, words: Sequence[str]) -> None:
         run([*self._buildah, "build", "--isolation", "chroot", "--layers", "--tag", name, *words], timeout_s=BUILD_S)
 
-    def _import_base(self, debian: str) -> None:
+    def _import_base(self) -> None:
         files, archive = self.directory / "base", self.directory / "base.tar"
         shutil.rmtree(files, ignore_errors=True)
         options = ["--variant=minbase", f"--include={PACKAGES}"]
-        run(["debootstrap", *options, "bookworm", str(files), debian], timeout_s=BUILD_S)
+        run(["debootstrap", *options, "bookworm", str(files), DEBIAN], timeout_s=BUILD_S)
         shutil.copy(CERTIFICATES, files / CERTIFICATES.relative_to("/"))
         run(["tar", "-C", str(files), "-cf", str(archive), "."])
         container = run([*self._buildah, "from", "scratch"]).stdout.strip()

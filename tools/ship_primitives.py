@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 from pydantic import JsonValue
 
+from benchmarks.measuring import one_line_errors
 from service.base import tensors
 from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
@@ -88,22 +88,19 @@ def _texts(value: JsonValue) -> Iterator[str]:
         yield from _texts(inner)
 
 
+@one_line_errors
 def main() -> int:
     """Parse the command line, publish a run's Bob if need be, ship, verify."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", metavar="RUN_DIR|NAME@ALIAS")
     parser.add_argument("--registry", type=Path, default=Path("registry"), metavar="DIR", help="of NAME@ALIAS")
     given = parser.parse_args()
-    try:
-        with tempfile.TemporaryDirectory() as scratch:
-            reference, source = given.source, Registry(given.registry)
-            if Path(reference).is_dir():
-                source = Registry(Path(scratch))
-                reference = str(publish_newest(RunDirectory(Path(given.source)), source))
-            version = ship(reference, source, BUNDLED)
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    with tempfile.TemporaryDirectory() as scratch:
+        reference, source = given.source, Registry(given.registry)
+        if Path(reference).is_dir():
+            source = Registry(Path(scratch))
+            reference = str(publish_newest(RunDirectory(Path(given.source)), source))
+        version = ship(reference, source, BUNDLED)
     bundled = Registry(BUNDLED)
     manifest = bundled.manifest(str(version))
     for name, value in manifest.metrics.items():

@@ -11,49 +11,25 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks import time_to_skill
-from benchmarks.report import (
-    champion,
-    comparison,
-    figures,
-    measured,
-    mutation,
-    pretraining,
-    recipe,
-    scaling,
-    skills,
-    summary,
-    transfer,
-)
+from benchmarks import scaling, time_to_skill, transfer
+from benchmarks.measuring import one_line_errors
+from benchmarks.report import comparison, figures, measured, pretraining, recipe, skills
 from benchmarks.report.downstream import draw_table, write_results
+from benchmarks.report.recipe import RECIPE
 from benchmarks.report.results import Result, read_trials
-from benchmarks.reproduce import Places, experiments
-from benchmarks.run_files import Run, read_run
+from benchmarks.reproduce import experiments
+from benchmarks.run_files import Run
 from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
 
-PROGRAMS = {
-    "env_throughput": "benchmarks.env_throughput",
-    "throughput": "benchmarks.compare_commits",
-    "world_speed": "benchmarks.compare_commits --worlds",
-    "deployed": "tools.deployed",
-    "mutation": "tools.mutation",
-    "scaling": "benchmarks.scaling of commit 82ca6fd",
-    "scaling_box": "benchmarks.scaling",
-    "robots": "benchmarks.robots",
-    "transfer": "benchmarks.transfer",
-    "transfer_champion": "benchmarks.transfer --name transfer_champion",
-}
-"""Modules by the name of the recorded file that they make."""
-RECIPE = "recipe"
-"""Name of the recorded time to a skill with the recipe, without any change."""
+FILES = ("env_throughput", "throughput", "world_speed", "deployed", "mutation", "scaling", "scaling_box", "robots",
+         "transfer", "transfer_champion")  # fmt: skip
+"""Names of the recorded files of which there is one each."""
 PAGES = {
     "results/pretraining.md": ("skill", "champion", "tasks", "curves", "curriculum", "coverage", "throughput"),
     "results/deployed.md": ("checks",),
@@ -73,23 +49,6 @@ Results = Mapping[str, Mapping[str, Any]]
 """Recorded files by the name of their benchmark."""
 Blocks = dict[str, list[str]]
 """Parts of the text of each block."""
-MEASURED: Mapping[str, Mapping[str, Sequence[tuple[str, Callable[[Mapping[str, Any]], str]]]]] = {
-    "results/deployed.md": {"checks": [("deployed", measured.checks_words), ("deployed", measured.checks_table)]},
-    "robots.md": {
-        "robots": [
-            ("robots", measured.robots_table), ("robots", measured.robots_words), ("world_speed", measured.speed_words)
-        ]
-    },
-    "results/transfer.md": {
-        name: [(name, transfer.transfer_table), (name, transfer.transfer_words)]
-        for name in ("transfer", "transfer_champion")
-    },
-    "results/README.md": {
-        "throughput": [("env_throughput", measured.ratios_block)],
-        "mutation": [("mutation", mutation.mutation_words), ("mutation", mutation.mutation_table)],
-    },
-}  # fmt: skip
-"""What says a block of a page, each from the recorded file of that name."""
 _NOTHING = "Not recorded yet."
 
 
@@ -116,35 +75,10 @@ def replace_blocks(path: Path, blocks: Mapping[str, str]) -> str:
     return page
 
 
-def read_results(results: Path) -> dict[str, dict[str, Any]]:
-    """Recorded files by the name of their benchmark; what is not there is left out."""
-    found = {}
-    for name, program in PROGRAMS.items():
-        path = results / f"{name}.json"
-        if not path.exists():
-            continue
-        try:
-            result = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise TandemError(f"cannot read {path}: {error}; make it with python -m {program}") from error
-        if not isinstance(result, dict) or name not in (result.get("benchmark"), result.get("tool")):
-            raise TandemError(f"{path} is not what python -m {program} writes; make it anew")
-        found[name] = result
-    return found
-
-
-def read_studies(directory: Path) -> dict[str, dict[str, Any]]:
-    """Recorded times to a skill by the name of their file."""
-    studies = {}
-    for path in sorted(directory.glob("*.json")):
-        with os_errors("read", path):
-            studies[path.stem] = json.loads(path.read_text(encoding="utf-8"))
-    return studies
-
-
-def read_all(directory: Path) -> list[Run]:
-    """Recorded runs in the order of their names."""
-    return [read_run(path) for path in sorted(directory.glob("*.json"))]
+def read_all(directory: Path, names: Collection[str] | None = None) -> dict[str, dict[str, Any]]:
+    """Recorded files of a directory by their names, in order; of ``names``, those that are there."""
+    paths = (path for path in sorted(directory.glob("*.json")) if names is None or path.stem in names)
+    return {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in paths}
 
 
 class Report:
@@ -161,34 +95,30 @@ class Report:
 
     def write(self) -> None:
         """Write all pages and pictures."""
-        found = read_results(self._results)
-        runs = [run for run in read_all(self._results / "runs") if "ablation" not in run]
-        studies = read_studies(self._results / "time_to_skill")
+        found = read_all(self._results, FILES)
+        runs = [run for run in read_all(self._results / "runs").values() if "ablation" not in run]
+        studies = read_all(self._results / "time_to_skill")
         trials, longer = (read_trials(self._results / name) for name in ("downstream", "downstream_longer"))
-        recorded_skills, controls = (read_all(self._results / name) for name in ("skills", "controls"))
+        recorded_skills, controls = (list(read_all(self._results / name).values()) for name in ("skills", "controls"))
         for page, names in PAGES.items():  # what is wrong with a page is found before anything is drawn
             words = replace_blocks(self._docs / page, dict.fromkeys(names, ""))
-            if page in ABOUT_THE_RECIPE and RECIPE in studies:
+            if page in ABOUT_THE_RECIPE:
                 recipe.check_words(self._docs / page, words, studies[RECIPE])
-        made = {
-            page: {
-                block: [part(found[name]) for name, part in parts if name in found] for block, parts in blocks.items()
-            }
-            for page, blocks in MEASURED.items()
-        }
-        headline = {"headline": [summary.headline_table(trials)] if trials else []}
-        made |= {
+        headline = {"headline": [comparison.headline_table(trials)]}
+        made = measured_blocks(found) | {
             "results/pretraining.md": self.pretraining_blocks(runs, found, studies),
             "results/skills.md": self.skills_blocks(recorded_skills, controls, runs),
             "results/comparison.md": self.comparison_blocks(trials, longer),
             "downstream.md": headline,
             "../README.md": headline,
-            "scaling.md": scaling_blocks(found, studies),
+            "scaling.md": {
+                "box": [scaling.box_block(found.get("scaling_box", found["scaling"]))],
+                "batches": [recipe.batches_block(studies), recipe.recipe_words(studies[RECIPE])],
+            },
         }
-        for page, names in PAGES.items():
-            blocks = made[page]
+        for page, blocks in made.items():
             path = self._docs / page
-            text = replace_blocks(path, {name: "\n\n".join(blocks.get(name, ())) for name in names})
+            text = replace_blocks(path, {name: "\n\n".join(blocks[name]) for name in PAGES[page]})
             with os_errors("write", path):
                 write_atomic(path, text.encode())
             self.files.append(path)
@@ -196,84 +126,93 @@ class Report:
 
     def pretraining_blocks(self, runs: Sequence[Run], found: Results, studies: Results) -> Blocks:
         """Parts of the blocks about pre-training."""
-        show, blocks = self._show, defaultdict[str, list[str]](list)
-        if RECIPE in studies:
-            blocks["skill"] = [recipe.recipe_words(studies[RECIPE]), time_to_skill.report(studies[RECIPE])]
-        if runs:
-            blocks["champion"] = [champion.champion_words(runs)]
-            blocks["tasks"] = [pretraining.tasks_table(runs)]
-            blocks["curves"] = [
+        show = self.show
+        counted = [run for run in runs if "curriculum" in run]  # older files have only a sample of the goals
+        covered = [run for run in runs if run.get("coverage")]
+        goals = [
+            show(f"Where the goals of {run['name']} were", f"pretraining-goals-{run['name']}", figures.draw_goals, run)
+            for run in runs
+        ]
+        coverage = [
+            show(
+                f"Random compositions of {run['name']}",
+                f"pretraining-coverage-{run['name']}",
+                figures.draw_coverage,
+                run,
+            )
+            for run in covered
+        ]
+        return {
+            "skill": [recipe.recipe_words(studies[RECIPE]), time_to_skill.report(studies[RECIPE])],
+            "champion": [pretraining.champion_words(runs)],
+            "tasks": [pretraining.tasks_table(runs)],
+            "curves": [
                 show("Over env steps", "pretraining", figures.draw_curves, runs),
                 show("Over wall-clock time", "pretraining-time", partial(figures.draw_curves, over_time=True), runs),
                 pretraining.training_table(runs),
-            ]
-        if counted := [run for run in runs if "curriculum" in run]:  # older files have only a sample of the goals
-            picture = show("The curriculum", "pretraining-curriculum", figures.draw_curriculum, counted)
-            blocks["curriculum"].append(picture)
-        for run in runs:
-            words, picture = f"Where the goals of {run['name']} were", f"pretraining-goals-{run['name']}"
-            blocks["curriculum"].append(show(words, picture, figures.draw_goals, run))
-        if covered := [run for run in runs if run.get("coverage")]:
-            blocks["coverage"].append(pretraining.coverage_table(covered))
-        for run in covered:
-            words, picture = f"Random compositions of {run['name']}", f"pretraining-coverage-{run['name']}"
-            blocks["coverage"].append(show(words, picture, figures.draw_coverage, run))
-        if "throughput" in found:
-            blocks["throughput"] = [pretraining.throughput_words(found["throughput"])]
-        return blocks
+            ],
+            "curriculum": [show("The curriculum", "pretraining-curriculum", figures.draw_curriculum, counted), *goals],
+            "coverage": [pretraining.coverage_table(covered), *coverage],
+            "throughput": [pretraining.throughput_words(found["throughput"])],
+        }
 
     def skills_blocks(self, runs: Sequence[Run], controls: Sequence[Run], pretrained: Sequence[Run]) -> Blocks:
         """Parts of the blocks about skills, and about controls of self-play."""
-        blocks = {}
-        if runs:
-            picture = self._show("Random skills at three stages of training", "skills", figures.draw_skills, runs)
-            blocks["coverage"] = [skills.coverage_table(runs), picture]
-        if learned := [run for run in runs if run["method"] != "ours"]:
-            picture = self._show("Skill discovery over env steps", "skills-curves", figures.draw_skill_curves, learned)
-            blocks["curves"] = [picture]
-        if controls:
-            blocks["controls"] = [skills.controls_table(controls), skills.alike_table([*pretrained, *controls])]
-        return blocks
+        stages = self.show("Random skills at three stages of training", "skills", figures.draw_skills, runs)
+        learned = [run for run in runs if run["method"] != "ours"]
+        curves = self.show("Skill discovery over env steps", "skills-curves", figures.draw_skill_curves, learned)
+        return {
+            "coverage": [skills.coverage_table(runs), stages],
+            "curves": [curves],
+            "controls": [skills.controls_table(controls), skills.alike_table([*pretrained, *controls])],
+        }
 
     def comparison_blocks(self, trials: Sequence[Result], longer: Sequence[Result]) -> Blocks:
         """Parts of the blocks that compare with the paper."""
-        places = Places(self._results, self._results)
-        blocks = {"missing": [comparison.missing_table(list(experiments(places)))]}
-        if trials:
-            blocks["rows"] = [comparison.comparison_table(trials)]
-            blocks["below"] = [comparison.distances_table(trials)]
-            blocks["harder"] = [comparison.harder_table(trials)]
-        if longer:
-            picture = self._show("Success over more env steps", "downstream-longer", draw_table, longer)
+        blocks = {
+            "rows": [comparison.comparison_table(trials)],
+            "longer": [],
+            "below": [comparison.distances_table(trials)],
+            "harder": [comparison.harder_table(trials)],
+            "missing": [comparison.missing_table(list(experiments(self._results)))],
+        }
+        if longer:  # none was recorded yet
+            picture = self.show("Success over more env steps", "downstream-longer", draw_table, longer)
             blocks["longer"] = [comparison.longer_table(trials, longer), picture]
         return blocks
 
-    def _show(self, words: str, name: str, draw: Callable[[Any, Path], Path], recorded: Any) -> str:
+    def show(self, words: str, name: str, draw: Callable[[Any, Path], Path], recorded: Any) -> str:
+        """Draw a picture; the line of a page that shows it."""
         self.files.append(draw(recorded, self._results / f"{name}.png"))
         return f"![{words}]({name}.png)"
 
 
-def scaling_blocks(found: Results, studies: Results) -> Blocks:
-    """Parts of the blocks about scaling."""
-    blocks = {}
-    if (box := found.get("scaling_box", found.get("scaling"))) is not None:  # the newer one, where there is one
-        blocks["box"] = [scaling.box_block(box)]
-    if studies:
-        blocks["batches"] = [scaling.batches_block(studies), recipe.recipe_words(studies[RECIPE])]
-    return blocks
+def measured_blocks(found: Results) -> dict[str, Blocks]:
+    """Parts of the blocks that are of one recorded file each, by page."""
+    deployed, robots, mutants = found["deployed"], found["robots"], found["mutation"]
+    speed = measured.speed_words(found["world_speed"])
+    return {
+        "results/deployed.md": {"checks": [measured.checks_words(deployed), measured.checks_table(deployed)]},
+        "robots.md": {"robots": [measured.robots_table(robots), measured.robots_words(robots), speed]},
+        "results/transfer.md": {
+            name: [transfer.transfer_table(found[name]), transfer.transfer_words(found[name])]
+            for name in PAGES["results/transfer.md"]
+        },
+        "results/README.md": {
+            "throughput": [measured.ratios_block(found["env_throughput"])],
+            "mutation": [measured.mutation_words(mutants), measured.mutation_table(mutants)],
+        },
+    }
 
 
+@one_line_errors
 def main() -> int:
     """Parse the command line, draw, say what was written."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--docs", type=Path, metavar="DIR", default=Path("docs"), help="default: %(default)s")
     given = parser.parse_args()
     report = Report(given.docs)
-    try:
-        report.write()
-    except TandemError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    report.write()
     print("\n".join(map(str, report.files)))
     return 0
 

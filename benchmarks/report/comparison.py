@@ -1,23 +1,27 @@
-"""The table of ``docs/results/comparison.md``: our success rates beside the paper's, cell by cell."""
+"""Success rates beside the paper's: the tables of ``docs/results/comparison.md``, and systems in four rows."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from benchmarks.report.downstream import PAPER, Seeds
-from benchmarks.report.markdown import Row, table
+from benchmarks.report.downstream import BEST, PAPER, Seeds, each_seed
+from benchmarks.report.markdown import Row, percent, table
 from benchmarks.report.results import TRIAL, Result, by_method_and_task
 from benchmarks.reproduce import Experiment
 from service.actors.evaluation import wilson_interval
 from service.envs.tasks import TASKS
 from service.methods.task_methods import METHODS
-from service.methods.task_rates import rate_of
+from service.methods.task_rates import Rate, rate_of
 
 PAPER_EPISODES = 48
 """Of each of the paper's rates, most likely: nearly all are multiples of 1/48, so 16 episodes of three seeds."""
+_OWN = "ours-her"
+"""The composing method of the summary."""
+_PAPER_SEEDS = 3
+"""Of every rate of the paper, as its table says."""
 
 
 def comparison_table(results: Sequence[Result]) -> str:
@@ -71,7 +75,9 @@ def harder_table(results: Sequence[Result]) -> str:
             {each[TRIAL]["seed"]: each for each in of.get((method, task), [])} for task in ("hard-push", "push")
         )
         if hard:
-            rows.append((METHODS[method].title, _each(hard.values()), _each(plain[s] for s in hard if s in plain)))
+            rows.append(
+                (METHODS[method].title, each_seed(hard.values()), each_seed(plain[s] for s in hard if s in plain))
+            )
     return table(("", "HardPush", "Push, the same seeds"), rows) if rows else ""
 
 
@@ -88,10 +94,6 @@ def missing_table(planned: Sequence[Experiment]) -> str:
     ]
     words = f"{sum(done.values())} of {len(planned)} experiments are recorded."
     return f"{words} Missing:\n\n{table(('', 'recorded', 'missing'), rows)}" if rows else words
-
-
-def _each(trials: Iterable[Result]) -> str:
-    return ", ".join(f"{100 * each['evaluation']['success_last']:.1f}" for each in trials)
 
 
 def _missing(group: Sequence[Experiment]) -> str:
@@ -130,3 +132,35 @@ def _cell(seeds: Seeds, paper: float) -> str:
     low, high = wilson_interval(round(paper * PAPER_EPISODES), PAPER_EPISODES)
     text = f"{100 * ours.mean:.1f} ({100 * paper:.0f}, {100 * (ours.mean - paper):+.0f})"
     return f"**{text}**" if ours.low > high or ours.high < low else text
+
+
+def headline_table(results: Sequence[Result]) -> str:
+    """Success at the last step: composing, Bob alone, and the best method of other kinds on each task.
+
+    Every cell has its number of seeds in brackets.
+    """
+    rates = {place: rate_of(seeds) for place, seeds in by_method_and_task(results).items()}
+    known = {method for method, _ in rates}
+    groups = {
+        "composing frozen primitives, with hindsight": [_OWN],
+        "Bob alone, no downstream step": ["asp-only"],
+        "learned from nothing": learning(None),
+        "skills of other methods, without hindsight": learning("skills"),
+    }
+    rows: list[Row] = []
+    for title, names in groups.items():
+        if found := [name for name in names if name in known]:
+            words = f"{title}, the best of up to {len(found)} on each task"
+            if len(found) == 1:
+                words = title if len(names) == 1 else f"{title}: {METHODS[found[0]].title}"
+            rows.append(
+                (words, *(_best([rates[name, task] for name in found if (name, task) in rates]) for task in TASKS))
+            )
+    rows.append(("*the best of the paper*", *(f"*{percent(rate)} ({_PAPER_SEEDS})*" for rate in BEST.values())))
+    words = "Success at the last step, the mean of the seeds; in brackets how many seeds."
+    return f"{table(('', *(task.title for task in TASKS.values())), rows)}\n\n{words}"
+
+
+def _best(rates: Sequence[Rate]) -> str:
+    best = max(rates, key=lambda rate: (rate.mean, rate.num_seeds), default=None)
+    return "" if best is None else f"{percent(best.mean)} ({best.num_seeds})"

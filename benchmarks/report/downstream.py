@@ -12,6 +12,7 @@ import numpy as np
 
 from benchmarks.report.markdown import Row, table
 from benchmarks.report.results import TRIAL, Result, by_method_and_task, read_trials
+from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
 from service.envs.tasks import HARD_TASKS, TASKS, find_task
 from service.media.figures import BLUE, FAINT, GREEN, ORANGE, new_figure, save, style_axes
@@ -67,6 +68,7 @@ def write_page(results: Sequence[Result], picture: str) -> str:
         results: of trials.
         picture: file name of the learning curves, beside the page.
     """
+    check_versions(results)
     of = by_method_and_task(results)
     parts = [
         "# Downstream\n\nWritten by `python -m benchmarks.report` from the files in `downstream/`, one for each trial, "
@@ -78,12 +80,11 @@ def write_page(results: Sequence[Result], picture: str) -> str:
         "they are of another world, likely a harder one "
         "([cell by cell](comparison.md), and what differs). Tasks and methods may have had different numbers of env "
         "steps: they are below.\n",
-        *_old_versions(results),
         _table(of, _rate("success_last"), paper=True),
         "\n## Success at any step\n",
         _table(of, _rate("success_ever")),
         "\n## Each seed, at the last step\n",
-        _table(of, _each_seed),
+        _table(of, each_seed),
         "\n## Learning curves\n",
         f"![Success at the last step over env steps; bands from the least to the greatest seed]({picture})\n",
         "Without noise, 100 goals a point; dotted: what learns nothing. Where a curve still rises, the tables say what "
@@ -100,44 +101,28 @@ def write_page(results: Sequence[Result], picture: str) -> str:
 
 
 def _harder(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
-    """The section on harder tasks, if any was run."""
-    tasks = _harder_ones(task for _, task in of)
-    if not tasks:
-        return ()
+    """The section on harder tasks."""
+    tasks = [name for name in HARD_TASKS if any(task == name for _, task in of)]
     return (
         "\n## A harder start and cube\n",
         "The end effector starts 20 cm above the table instead of 8, and the cube has 1 kg instead of 0.1 and half the "
         "grip ([decision 7](../decisions/0007-the-downstream-tasks.md)). At the last step, each seed, and at any "
         "step:\n",
         _table(of, _rate("success_last"), tasks=tasks),
-        _table(of, _each_seed, tasks=tasks),
+        _table(of, each_seed, tasks=tasks),
         _table(of, _rate("success_ever"), tasks=tasks),
         "Env steps and time:\n",
         _table(of, _cost, tasks=tasks),
     )
 
 
-def _harder_ones(names: Iterable[str]) -> list[str]:
-    found = set(names)
-    return [name for name in HARD_TASKS if name in found]
-
-
-def _old_versions(results: Sequence[Result]) -> Sequence[str]:
-    """Lines about results of other versions of the tasks than today's, by the methods that have them."""
-    tasks_of: dict[str, list[str]] = {}
-    for name, task in {**TASKS, **HARD_TASKS}.items():
-        trials = [result[TRIAL] for result in results if result[TRIAL]["task"] == name]
-        old = {each["method"] for each in trials if each.get("task_version", 0) != task.version}
-        if old:
-            methods = ", ".join(METHODS[method].title for method in METHODS if method in old)
-            who = "all methods" if old == {each["method"] for each in trials} else methods
-            tasks_of.setdefault(who, []).append(f"`{task.id}`")
-    return [
-        f"Recorded before {', '.join(ids)} ({who}), with other contacts "
-        "([decision 10](../decisions/0010-a-cheaper-better-grip.md)), and *Box* with another rule of success "
-        "([decision 7](../decisions/0007-the-downstream-tasks.md)).\n"
-        for who, ids in tasks_of.items()
-    ]
+def check_versions(results: Sequence[Result]) -> None:
+    """Refuse results of other versions of the tasks than today's."""
+    for trial in (result[TRIAL] for result in results):
+        if trial.get("task_version", 0) != find_task(trial["task"]).version:
+            raise TandemError(
+                f"{trial['method']} on {trial['task']} was recorded with another version of it: reproduce it"
+            )
 
 
 def _table(
@@ -173,7 +158,8 @@ def _rate(key: str) -> Callable[[Seeds], str]:
     return lambda seeds: str(rate_of(seeds, key)).replace("*", "\\*")
 
 
-def _each_seed(seeds: Seeds) -> str:
+def each_seed(seeds: Iterable[Result]) -> str:
+    """Success of each at the last step."""
     return ", ".join(f"{100 * result['evaluation']['success_last']:.1f}" for result in seeds)
 
 
@@ -192,8 +178,6 @@ def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
     known = {name: method for name, method in METHODS.items() if any(found == name for found, _ in of)}
     composing = [name for name, method in known.items() if method.composes]
     scratch = [name for name, method in known.items() if method.learns and method.takes is None]
-    if not composing or not scratch:
-        return ()
     rows = []
     for method in composing:
         own, others = [METHODS[method].title], ["*best from scratch*"]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from benchmarks.record_run import BIN_M, NUM_BINS, NUM_SLICES
+from benchmarks.record_run import ASKED, BIN_M, NUM_BINS, NUM_SLICES
 from benchmarks.report.skills import METHODS, by_method
 from benchmarks.run_files import (
     CELL_SIZE_M,
@@ -25,7 +25,6 @@ from benchmarks.run_files import (
     paths_m,
     unthin,
 )  # fmt: skip
-from benchmarks.tasks import ASKED
 from service.base.files import os_errors, write_atomic
 from service.base.jsonl import JsonlWriter
 from service.base.types import StateArray

@@ -2,15 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from benchmarks.record_run import ASKED, ASKED_RATES, ASKED_STEPS, NUM_STEPS, TASKS
 from benchmarks.report.markdown import Row, duration, millions, percent, table
 from benchmarks.run_files import RANDOM, STAGES, Records, Run, binned, mean_share, steps_until, unthin
-from benchmarks.tasks import ASKED, ASKED_RATES, ASKED_STEPS, NUM_STEPS, TASKS
+from service.config.self_play import SelfPlayConfig
+from service.registry.bundled import BUNDLED
+from service.registry.digest import parameters_digest
+from service.registry.loading import load
 
 NUM_BINS = 10
 """Equal parts of a run's env steps; rates are those of the last, distances and heights also those of the first."""
+CHAMPION = "panda-cube@champion"
+DIGITS = 12
+"""Of a digest on a page, as in the table of tasks."""
+
+
+def champion_words(runs: Sequence[Run]) -> str:
+    """The bundled champion: its version, digest, run, and what its manifest says it solved when it was published."""
+    bob = load(CHAMPION, BUNDLED)
+    assert bob.manifest is not None  # it is a published version
+    assert isinstance(bob.config, SelfPlayConfig)
+    alike = [run["name"] for run in runs if run["config"] == bob.manifest.config]
+    made_by = f"the run {alike[0]}" if alike else "made by no run that is recorded here"
+    manifest, config = bob.manifest, bob.config
+    rates = ", ".join(
+        f"{percent(manifest.metrics[f'evaluation/{goals}_success_last'], 1)} of {goals}"
+        for goals in ("mixed", "air", "table")
+    )
+    return (
+        f"`{CHAMPION}`, in the package, is version {manifest.version}, {made_by}: seed {manifest.config['seed']}, "
+        f"{config.policy.bob.num_primitives} primitives, {millions(manifest.metrics['env_steps'])} env steps, "
+        f"parameters `{parameters_digest(bob.primitives)[:DIGITS]}`. When it was published it had {rates} "
+        f"goals, {config.run.final_episodes} of each."
+    )
 
 
 def tasks_table(runs: Sequence[Run]) -> str:
@@ -25,10 +52,10 @@ def tasks_table(runs: Sequence[Run]) -> str:
     return table(head, [*rows, ("asked for", *asked, millions(ASKED_STEPS)), ("doing nothing", *idle, "")])
 
 
-def tasks_cells(evaluations: Records, tasks: Iterable[str] = TASKS, *, idle: bool = False) -> list[str]:
+def tasks_cells(evaluations: Records, *, idle: bool = False) -> list[str]:
     """Success at the last step on each task, empty where it was not measured."""
     rows = {row["goals"]: row for row in evaluations if (row["policy"] == "idle") == idle}
-    return [_success(rows[task]) if task in rows else "" for task in tasks]
+    return [_success(rows[task]) if task in rows else "" for task in TASKS]
 
 
 def _judged(evaluations: Records) -> list[str]:

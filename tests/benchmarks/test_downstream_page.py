@@ -1,8 +1,10 @@
-"""The page of downstream results, by hand."""
+"""Parts of the page of downstream results that the recorded ones do not show."""
 
+import pytest
 from PIL import Image
 
-from benchmarks.report.downstream import BEST, PAPER, draw_table, steps_until, write_page
+from benchmarks.report.downstream import BEST, PAPER, check_versions, draw_table, steps_until
+from service.base.errors import TandemError
 
 
 def result(method, task, seed, last, ever, curve=(), num=100):
@@ -18,40 +20,6 @@ def result(method, task, seed, last, ever, curve=(), num=100):
     }
 
 
-def test_the_page_by_hand():
-    curve = [{"env_steps": 1000 * step, "success_last": rate} for step, rate in enumerate((0.0, 0.9, 0.4, 0.8, 0.9))]
-    page = write_page(
-        [result("ours", "wall", 1, 0.97, 1.0, curve), result("ours", "wall", 0, 0.95, 0.97, curve)], "picture.png"
-    )
-    lines = page.splitlines()
-    # std 0.01414 of two seeds: 0.96 - 12.706 * 0.01414 / sqrt(2) is 0.833
-    assert "| ours |  |  |  |  | 96.0 % [83, 100] (2) |  |" in lines
-    assert "| *the paper's* | *83 %* | *100 %* | *52 %* | *100 %* | *98 %* | *98 %* |" in lines
-    assert "| ours |  |  |  |  | 98.5 % [79, 100] (2) |  |" in lines
-    assert "| ours |  |  |  |  | 95.0, 97.0 |  |" in lines
-    assert "| ours |  |  |  |  | 10.5 M + 2, 1 min |  |" in lines
-    assert "scratch" not in page
-
-
-def test_harder_tasks_have_a_section_of_their_own():
-    page = write_page([result("ours", "wall", 0, 0.96, 0.96)], "picture.png")
-    assert "A harder start" not in page
-    results = [
-        result("ours", "wall", 0, 0.96, 0.96),
-        result("ours", "hard-push", 0, 0.50, 0.75),
-        result("asp-only", "hard-push", 0, 0.10, 0.10),
-    ]
-    for each in results:
-        each["cell"]["task_version"] = 1
-    page = write_page(results, "picture.png")
-    plain, _, harder = page.partition("## A harder start and cube")
-    assert "HardPush" not in plain
-    assert r"| ours |  |  |  |  | 96.0 % [90, 98]\* (1) |  |" in plain.splitlines()
-    # 50 of 100, Wilson (z = 1.96) is 0.404 to 0.596
-    assert {"|  | HardPush |", r"| ours | 50.0 % [40, 60]\* (1) |", "| ours | 50.0 |"} <= set(harder.splitlines())
-    assert "paper" not in harder
-
-
 def test_pictures_of_learning_have_a_panel_for_each_task(tmp_path):
     tasks, sizes = ("larger", "inair", "push", "hard-push", "hard-box"), []
     for num in (0, 3, 4):
@@ -63,45 +31,12 @@ def test_pictures_of_learning_have_a_panel_for_each_task(tmp_path):
     assert sizes[2][1] > 1.5 * sizes[1][1]  # two rows of panels, not one
 
 
-def test_what_a_page_says_of_its_origin_by_hand():
-    first, second = result("ours", "box", 0, 0.5, 0.5), result("idle", "box", 0, 0.0, 0.0)
-    first["made"]["git_commit"] = "d" * 40 + "-dirty"
-    second["primitives"] = None
-    lines = write_page([first, second], "picture.png").splitlines()
-    assert lines[-1] == f"Primitives: panda-cube@4 (abababababab). Commits: {'c' * 12}, {'d' * 12}-dirty."
-    (old,) = [line for line in lines if "Recorded before" in line]
-    assert old.startswith("Recorded before `tandem/Box-v1` (all methods), with other contacts")
-    second["cell"]["task_version"] = 1
-    assert "Recorded before `tandem/Box-v1` (ours)" in write_page([first, second], "picture.png")
-    first["cell"]["task_version"] = 1
-    assert "Recorded before" not in write_page([first, second], "picture.png")
-    lines = write_page([first, second, result("ours", "wall", 0, 0.5, 0.5)], "picture.png").splitlines()
-    (old,) = [line for line in lines if "Recorded before" in line]
-    assert old.startswith("Recorded before `tandem/Wall-v1` (all methods), ")
-
-
-def test_how_soon_beside_what_learns_from_nothing_by_hand():
-    def learned(method, task, seed, last, *rates):
-        points = [{"env_steps": 1000 * step, "success_last": rate} for step, rate in enumerate(rates, 1)]
-        return result(method, task, seed, last, last, points)
-
-    page = write_page(
-        [
-            learned("ours", "wall", 0, 0.9, 0.0, 0.9, 0.9),  # 0.9 x 0.8, the mean of the seeds: 3,000 env steps
-            learned("ours", "wall", 1, 0.7, 0.1, 0.2, 0.3, 0.9, 0.7),  # 5,000
-            learned("scratch-monolithic", "wall", 0, 0.3, 0.1, 0.3, 0.3),
-            learned("scratch-monolithic-her", "wall", 0, 0.8, 0.1, 0.3, 0.5, 0.8, 0.8),  # 5,000
-            learned("ours", "box", 0, 0.9, 0.0, 0.9, 0.9),
-            learned("scratch-monolithic", "box", 0, 0.3, 0.1, 0.3, 0.3),  # never
-            learned("ours", "push", 0, 0.9, 0.0, 0.9, 0.9),  # nothing to compare with
-            learned("ours", "inair", 0, 0.9, 0.0, 0.8, 0.8),  # 0.81 is not held
-            learned("scratch-monolithic", "larger", 0, 0.3, 0.1, 0.3, 0.3),
-        ],
-        "picture.png",
-    )
-    lines = page.splitlines()
-    assert "| ours |  |  | 3 |  | 4 | 3 |" in lines
-    assert "| *best from scratch* |  |  |  |  | *5, scratch monolithic + HER (2)* | *> 2 (1)* |" in lines
+def test_results_of_another_version_of_a_task_are_refused():
+    today = result("ours", "wall", 0, 0.5, 0.5)
+    today["cell"]["task_version"] = 1
+    check_versions([today])
+    with pytest.raises(TandemError, match="another version"):
+        check_versions([today, result("ours", "box", 0, 0.5, 0.5)])
 
 
 def test_how_soon_by_hand():

@@ -3,10 +3,9 @@
 import sys
 from itertools import pairwise
 
-import pytest
 import typer
 
-from benchmarks.reproduce import SKILL_ENV_STEPS, Experiment, Places, experiments, run_all
+from benchmarks.reproduce import SKILL_ENV_STEPS, Experiment, experiments, run_all
 from benchmarks.trials import trial_config
 from service.cli.main import app
 from service.config import load_config
@@ -15,13 +14,8 @@ from service.envs.tasks import TASKS
 from service.methods.task_methods import METHODS
 
 
-@pytest.fixture
-def places(tmp_path):
-    return Places(tmp_path / "out", tmp_path / "runs")
-
-
-def test_every_method_is_run_on_every_task_with_three_seeds(places):
-    everything = list(experiments(places))
+def test_every_method_is_run_on_every_task_with_three_seeds(tmp_path):
+    everything = list(experiments(tmp_path))
     names = [each.name for each in everything]
     assert len(set(names)) == len(names) == len({each.file for each in everything})
     assert {f"downstream/{task}-{method}-{seed}" for task in TASKS for method in METHODS for seed in range(3)} <= set(
@@ -29,11 +23,11 @@ def test_every_method_is_run_on_every_task_with_three_seeds(places):
     )
 
 
-def test_every_command_is_accepted_by_its_program(places):
+def test_every_command_is_accepted_by_its_program(tmp_path):
     """Commands are parsed, and the configurations that they stand for are made."""
     main = typer.main.get_command(app)
-    for each in experiments(places):
-        for _, _, module, *words in each.commands():
+    for each in experiments(tmp_path):
+        for _, _, module, *words in each.commands:
             if module == "benchmarks.trials":
                 task, method, seed = words[:3]
                 settings = [value for option, value in pairwise(words) if option == "--set"]
@@ -49,7 +43,7 @@ def test_every_command_is_accepted_by_its_program(places):
 def making(tmp_path, name, *, needs=None, code=0):
     """An experiment that writes its name, unless it fails."""
     program = f"import pathlib, sys; {code} or pathlib.Path({str(tmp_path / name)!r}).touch(); sys.exit({code})"
-    return Experiment(name, tmp_path / name, "", name, 0, lambda: [(sys.executable, "-c", program)], needs)
+    return Experiment(name, tmp_path / name, "", name, 0, [(sys.executable, "-c", program)], needs)
 
 
 def test_one_waits_for_what_it_needs_and_failures_are_named(tmp_path):

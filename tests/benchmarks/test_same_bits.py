@@ -13,12 +13,6 @@ from service.base.errors import TandemError
 ROW = Row("a row", "")
 
 
-@pytest.fixture(autouse=True)
-def same_names(monkeypatch):
-    """Both sides are written here, by the names of today."""
-    monkeypatch.setattr(same_bits, "RENAMED", {})
-
-
 def header(env_steps=20, words=(1, 2**100), wall_s=3.5):
     meta = {
         "env_steps": env_steps,
@@ -35,14 +29,12 @@ def records(*losses, time_s=1.0):
     ]
 
 
-def make_run(
-    path, weights=(0.0, 1.0), metrics=None, *, checkpoints="checkpoints", name="bob/weight", dtype=np.float32, **changed
-):
-    (path / checkpoints).mkdir(parents=True)
+def make_run(path, weights=(0.0, 1.0), metrics=None, *, name="bob/weight", dtype=np.float32, **changed):
+    (path / "checkpoints").mkdir(parents=True)
     arrays = {name: np.array(weights, dtype), "steps": np.array(7, np.int64)}
-    save_file(arrays, path / checkpoints / "checkpoint-e00000002-00000002.safetensors", metadata=header(**changed))
+    save_file(arrays, path / "checkpoints" / "checkpoint-e00000002-00000002.safetensors", metadata=header(**changed))
     old = {"steps": np.zeros(3)}  # of a process before, after more steps
-    save_file(old, path / checkpoints / "checkpoint-e00000001-00000009.safetensors")
+    save_file(old, path / "checkpoints" / "checkpoint-e00000001-00000009.safetensors")
     lines = {"metrics.jsonl": metrics or records(0.0, 0.25), "goals.jsonl": [{"iteration": 1, "goals": [[0.1, 0.0]]}]}
     for file, each in lines.items():
         (path / file).write_text("".join(json.dumps(line) + "\n" for line in each))
@@ -101,22 +93,15 @@ def test_late_metrics_may_come_with_another_record(tmp_path):
     assert compare_runs(old, new, ROW)["differing"] == ["metrics.jsonl/loss from record 1 on"]
 
 
-def test_a_tree_that_renames(tmp_path, monkeypatch):
-    row = Row("a row", "", checkpoints=("checkpoints", "saved"))
-    monkeypatch.setattr(same_bits, "RENAMED", {"checkpoint/bob/": "checkpoint/learner/bob/", "header/step": None})
-    changed = {"checkpoints": "saved", "name": "learner/bob/weight"}
-    assert differing(tmp_path, row, **changed) == ["header/step"]
-    monkeypatch.setattr(same_bits, "RENAMED", {"checkpoint/bob/": "checkpoint/learner/bob/"})
-    assert compare_runs(tmp_path / "old", tmp_path / "new", row)["differing"] == []
-
-
 def test_nothing_to_compare(tmp_path):
-    with pytest.raises(TandemError, match=r"no checkpoint in .*new/saved"):
-        differing(tmp_path, Row("a row", "", checkpoints=("checkpoints", "saved")))
-    for run in ("old", "new"):
-        (tmp_path / run / "metrics.jsonl").unlink()
+    old, new = make_run(tmp_path / "old"), make_run(tmp_path / "new")
+    for checkpoint in (new / "checkpoints").iterdir():
+        checkpoint.unlink()
+    with pytest.raises(TandemError, match=r"no checkpoint in .*new"):
+        compare_runs(old, new, ROW)
+    (old / "metrics.jsonl").unlink()
     with pytest.raises(FileNotFoundError):
-        compare_runs(tmp_path / "old", tmp_path / "new", ROW)
+        compare_runs(old, old, ROW)
 
 
 def test_report_by_hand():

@@ -3,23 +3,18 @@
 import numpy as np
 import pytest
 
-from benchmarks.report import transfer as page
 from benchmarks.transfer import (
     ROWS,
     Played,
     Settings,
-    benchmark,
     draw_episodes,
     inside_limits,
     play_chunk,
-    report,
     summarise,
 )
 from benchmarks.transfer import policy_of as policy_of_row
-from service.base.errors import TandemError
 from service.robot.calibrate import Calibration
 
-MACHINE = {"num_cpus": 2, "cpu": "a processor", "git_commit": "a" * 40, "time": "2026-11-24T10:00:00+00:00"}
 CALIBRATION = Calibration(
     robot="pybullet",
     arm="panda",
@@ -75,36 +70,3 @@ def test_a_chunk_is_played_alike_again_in_the_real_engine():
     assert [each.num_steps for each in first] == [8, 8]
     assert play_chunk(*asked) == first
     assert all(0 < each.free[0] <= 8 for each in first)  # it comes from above
-
-
-def test_an_unknown_row_is_told_in_one_line():
-    with pytest.raises(TandemError, match="--rows: no row 'windy'; choose of nominal, together"):
-        benchmark(Settings(rows="windy"))
-
-
-def test_the_page_has_a_row_for_each_and_says_what_was_not_measured():
-    played = Played(reached=True, ever=True, stopped="", inside=(45, 50), num_steps=50, free=(20, 19))
-    row = summarise([played] * 50) | {
-        "calibration": CALIBRATION.model_dump(mode="json"),
-        "asked": 0.97,
-    }
-    result = {
-        "rows": {"nominal": row},
-        "policy": {"label": "some-policy@1"},
-        "settings": {
-            "num_steps": 50,
-            "set_points_per_step": 10,
-            "max_speed_m_s": 1.7,
-            "max_acceleration_m_s2": 13.0,
-            "grip_force_n": 140.0,
-        },
-        "nominal_world": {"success_last": 0.98},
-        "machine": MACHINE,
-    }
-    text = page.transfer_table(result)
-    assert "| panda-gym's arm and cube | 100.0 % (93 % to 100 %) | 100.0 % | 60 %, 60 %, 50 % | 97 % | yes |" in text
-    assert text.count("| not measured |") == len(ROWS) - 1
-    words = page.transfer_words(result)
-    assert "some-policy@1, 50 goals a row" in words
-    assert "the tip itself in 90.0 %: in 95.00 % of those in which the arm touches nothing (40 % of all)" in words
-    assert "| nominal | 100.0 % |" in report(result)

@@ -69,16 +69,6 @@ def test_what_learns_nothing_plays_and_is_recorded(tmp_path, monkeypatch, capsys
     assert "unknown method 'none'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("text", "why"), [("{", "no result"), ('{"format_version": 1}', "cell: "), (None, "format version 7")]
-)
-def test_what_is_no_result_is_named(tmp_path, text, why):
-    text = text or json.dumps(recorded("wall-asp-only-0") | {"format_version": 7})
-    (tmp_path / "wall.json").write_text(text)
-    with pytest.raises(TandemError, match=f"wall.json.*{why}"):
-        read_trials(tmp_path)
-
-
 def test_seeds_of_a_method_on_a_task_are_in_order():
     results = [{"cell": {"method": "ours", "task": "wall", "seed": seed}} for seed in (2, 0, 10)]
     found = by_method_and_task([*results, {"cell": {"method": "ours", "task": "box", "seed": 0}}])

@@ -1,9 +1,8 @@
-"""Which keys an object of Kubernetes, KubeRay or Compose may have: enough of their schemas to find a typo.
+"""Which keys an object of Kubernetes or KubeRay may have: enough of their schemas to find a typo.
 
 No package that we install has these schemas, so they are written down here as far as our files use them, from the API
-references of KubeRay 1.7 and Kubernetes 1.32 and the Compose specification. A shape is a type, a list of one shape, a
-dictionary of shapes (a key that ends in ``!`` has to be there; ``*`` stands for any key), a set of allowed values, or
-``object`` for anything.
+references of KubeRay 1.7 and Kubernetes 1.32. A shape is a type, a list of one shape, a
+dictionary of shapes (a key that ends in ``!`` has to be there; ``*`` stands for any key), or a set of allowed values.
 """
 
 ONE_OF = (str, int)
@@ -128,49 +127,9 @@ SPECS = {
 }
 METADATA = {"name!": str, "labels": {"*": str}}
 
-DURATION_TEST = {"test!": [str], "interval!": str, "timeout!": str, "start_period": str}
-COMPOSE = {
-    "name!": str,
-    "services!": {
-        "*": {
-            "image!": str,
-            "build": {"context!": str, "dockerfile!": str, "args": {"*": str}},
-            "profiles": [str],
-            "user": str,
-            "entrypoint": [str],
-            "command": [str],
-            "environment": {"*": str},
-            "secrets": [str],
-            "ports": [str],
-            "volumes": [str],
-            "tmpfs": [str],
-            "read_only": bool,
-            "shm_size": str,
-            "stop_grace_period": str,
-            "healthcheck": DURATION_TEST,
-            "depends_on": object,
-            "deploy": {
-                "replicas": str,
-                "resources": {
-                    "limits": {"cpus": str, "memory!": str},
-                    "reservations": {"devices!": [{"driver!": str, "count!": int, "capabilities!": [str]}]},
-                },
-            },
-            "restart!": {"unless-stopped"},
-            "init!": bool,
-            "cap_drop!": [{"ALL"}],
-            "security_opt!": [{"no-new-privileges:true"}],
-        }
-    },
-    "secrets!": {"*": {"environment!": str}},
-    "volumes!": {"*": type(None)},
-}
-
 
 def mistakes(tree, shape, path="it"):
     """What does not fit, in one sentence each."""
-    if shape is object:
-        return []
     if isinstance(shape, (type, tuple)):
         fits = isinstance(tree, shape) and (shape is bool or not isinstance(tree, bool))
         return [] if fits else [f"{path} is {tree!r}, which is no {shape}"]

@@ -6,11 +6,7 @@ import subprocess
 import sys
 import tomllib
 
-import pytest
-
 from tests.deploy.files import DEPLOY, ROOT
-
-INSTRUCTIONS = {"ARG", "CMD", "COPY", "ENTRYPOINT", "ENV", "FROM", "LABEL", "RUN", "USER", "WORKDIR"}
 
 
 def instructions():
@@ -45,10 +41,6 @@ def ignored(path):
     return f"!{path.split('/')[0]}" not in lines
 
 
-def test_instructions_are_known():
-    assert {word for word, _ in instructions()} == INSTRUCTIONS
-
-
 def test_indexes_are_arguments():
     values = {rest.split("=")[0]: rest.split("=")[1] for word, rest in stages()["packages"][1] if word == "ARG"}
     assert values == {
@@ -74,9 +66,8 @@ def test_what_is_copied_is_there_and_not_ignored():
     assert all((ROOT / name).exists() and not ignored(name) for name in names)
 
 
-@pytest.mark.parametrize("path", [".env", "deploy/compose/.env", "runs", ".git", ".venv", "registry", "tests"])
-def test_what_must_not_be_in_an_image_is_ignored(path):
-    assert ignored(path)
+def test_what_must_not_be_in_an_image_is_ignored():
+    assert all(map(ignored, [".env", "deploy/compose/.env", "runs", ".git", ".venv", "registry", "tests"]))
 
 
 def test_versions_are_pinned():
@@ -108,13 +99,7 @@ def test_it_does_not_run_as_root():
     assert dict(stages()[""][1])["ENTRYPOINT"] == '["tandem"]'
 
 
-def test_packages_of_the_system_are_few():
-    (run,) = [shell(rest) for word, rest in stages()[""][1] if word == "RUN" and "apt-get install" in rest]
-    assert "--no-install-recommends libegl1 libgl1 wget" in re.sub(r"\s+", " ", run)
-    assert "rm -rf /var/lib/apt/lists/*" in run
-
-
-@pytest.mark.parametrize("script", [shell(rest) for word, rest in instructions() if word == "RUN"])
-def test_commands_are_shell(script):
-    result = subprocess.run(["sh", "-n"], input=script, capture_output=True, text=True, timeout=600, check=False)
-    assert result.returncode == 0, result.stderr
+def test_commands_are_shell():
+    for script in (shell(rest) for word, rest in instructions() if word == "RUN"):
+        result = subprocess.run(["sh", "-n"], input=script, capture_output=True, text=True, timeout=600, check=False)
+        assert result.returncode == 0, result.stderr

