@@ -12,6 +12,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
+from io import UnsupportedOperation
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from types import TracebackType
@@ -154,8 +155,11 @@ class Display:
         if self._bars.tasks and self.moves:
             self._bars.answer = text
             return
-        with suppress(OSError, ValueError):  # it is closed, or no file
-            os.write(self.console.file.fileno(), f"{text}\n".encode())
+        with suppress(OSError, ValueError):  # it is closed
+            try:
+                os.write(self.console.file.fileno(), f"{text}\n".encode())
+            except UnsupportedOperation:  # it is no file, as in a notebook
+                self.console.file.write(f"{text}\n")
 
     def _new_bars(self) -> _Bars:
         # What commands print for other programs must not come onto our console when it is sent somewhere else.

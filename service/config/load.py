@@ -51,7 +51,10 @@ def parse_config(tree: dict[str, Any], *, where: str) -> Config:
     method = tree.get("method", DEFAULT_METHOD)
     if not isinstance(method, str):
         raise ConfigError(f"{where}: method = {method!r}: expected a name")
-    kind = find_class(method)
+    try:
+        kind = find_class(method)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
     if "method" in tree:
         tree = {**tree, "method": exact_name(method)}
     try:

@@ -174,7 +174,7 @@ def test_no_goal_that_is_replayed_from_a_reset_is_inside_one():
         snapshot = TaskGenerator(config, worlds.layout).snapshot()
         put(worlds, object=(-0.2, 0.0, 0.025), obstacle_1=(0.0, 0.1, 0.025))
         goals = np.array([[0.01, 0.1, 0.03], [0.0, 0.0, 0.2]])
-        found = snapshot._weight_from_reset(goals, worlds.states, worlds.object_position) > 0.0
+        found = snapshot._is_task(goals, worlds.states, worlds.object_position)
     assert found.tolist() == [False, True]
 
 
