@@ -9,8 +9,8 @@ from benchmarks.report.downstream import BEST
 from benchmarks.report.markdown import Row, percent, table
 from benchmarks.report.results import Result, by_method_and_task
 from service.envs.tasks import TASKS
+from service.methods.task_evaluation import Rate, rate_of
 from service.methods.task_methods import METHODS
-from service.methods.task_rates import Rate, rate_of
 
 _OWN = "ours-her"
 """The composing method of the summary."""

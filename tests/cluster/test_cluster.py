@@ -20,9 +20,9 @@ from service.cluster import watch
 from service.cluster.ray_actors import NICENESS
 from service.cluster.ray_connection import ClusterOptions, connected
 from service.cluster.ray_runtime import RayRuntime
-from service.cluster.raylet import RayletWatch
 from service.cluster.remote_worker import RemoteWorker
 from service.cluster.self_play import MAX_FAILED_ROUNDS, RaySelfPlay, num_gpus
+from service.cluster.watch import RayletWatch
 from service.cluster.worker_variables import WORKER_VARIABLES
 from service.methods.method import StateLostError, WorkersError
 from service.runs.run import Run
@@ -453,7 +453,7 @@ def test_actors_that_wait_for_a_core_do_not_end_the_run(tmp_path):
 
 
 def test_a_raylet_that_is_frozen_is_silent_and_one_that_stays_so_is_given_up(monkeypatch):
-    monkeypatch.setattr("service.cluster.raylet.SILENT_S", 1.0)
+    monkeypatch.setattr("service.cluster.watch.SILENT_S", 1.0)
     pid = next(pid for pid, role in descendants(os.getpid()).items() if role == "raylet")
     lost = []
 
@@ -471,7 +471,7 @@ def test_a_raylet_that_is_frozen_is_silent_and_one_that_stays_so_is_given_up(mon
             os.kill(pid, signal.SIGCONT)
             wait_until(lambda: not raylet.silent)
             assert lost == []
-            monkeypatch.setattr("service.cluster.raylet.LOST_S", 2.0)
+            monkeypatch.setattr("service.cluster.watch.LOST_S", 2.0)
             os.kill(pid, signal.SIGSTOP)
             wait_until(lambda: lost)
         finally:

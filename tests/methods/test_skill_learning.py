@@ -102,7 +102,7 @@ def test_losing_the_object_gives_back_what_moving_it_has_earned(method):
     np.testing.assert_allclose(seen.after, [at[1], at[0], at[0]], atol=1e-5)
     np.testing.assert_array_equal(seen.stepped, [True, False, False])
     learned, paid = [], []
-    reward.learn = lambda *tensors: learned.append(tensors) or {"representation_loss": 0.0}
+    reward.learn = lambda *tensors: learned.append(tensors) or 0.0
     pay = reward.rewards
     reward.rewards = lambda *tensors: paid.append(tensors) or pay(*tensors)
     batches = IntrinsicBatches(reward, config, lambda rows: see_object(rows, workspace))
