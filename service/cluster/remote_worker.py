@@ -155,7 +155,7 @@ class RemoteWorker:
                 )
             self._on_wait()
         try:
-            self._location = ray.get(answer)
+            self._location, *_ = ray.get([answer, *self.made])  # all: Ray prints errors that were not asked for
         except RayTaskError as error:
             if isinstance(error.cause, TandemError):  # for people; where it was raised is not
                 raise WorkersError(str(error.cause)) from None
