@@ -136,9 +136,7 @@ class ActorPool:
     """
 
     def __init__(self, config: SelfPlayConfig, num_threads: int, first_incarnation: int, clock: Clock) -> None:
-        self.num_worlds = config.game.num_worlds
-        """Worlds of each actor."""
-        self._config, self._num_threads, self._clock = config, num_threads, clock
+        self.config, self._num_threads, self._clock = config, num_threads, clock
         self._slots: dict[int, ActorSlot] = {}
         self._incarnations: dict[int, int] = defaultdict(lambda: first_incarnation)
         """The next incarnation of every place; one that goes and comes again begins no rollout id anew."""
@@ -203,6 +201,6 @@ class ActorPool:
     def _spawn(self, index: int) -> ActorSlot:
         incarnation = self._incarnations[index]
         self._incarnations[index] = incarnation + 1
-        handle = self._actor.remote(self._config, index, incarnation, self._num_threads)
+        handle = self._actor.remote(self.config, index, incarnation, self._num_threads)
         watch = Watch(handle.progress.remote, self._clock)
         return ActorSlot(index, incarnation, handle, handle.ping.remote(), watch)

@@ -70,7 +70,7 @@ class RemoteWorker:
         for attempt in range(START_ATTEMPTS):
             if attempt:
                 self.close()
-                self._pause(BACK_OFF_S * 2 ** (attempt - 1))
+                time.sleep(BACK_OFF_S * 2 ** (attempt - 1))
                 self._spawn()
             try:
                 self._wait_until_ready()
@@ -160,12 +160,6 @@ class RemoteWorker:
             if isinstance(error.cause, TandemError):  # for people; where it was raised is not
                 raise WorkersError(str(error.cause)) from None
             raise
-
-    def _pause(self, seconds: float) -> None:
-        until_s = time.monotonic() + seconds
-        while (left_s := until_s - time.monotonic()) > 0.0:
-            time.sleep(min(POLL_S, left_s))
-            self._on_wait()
 
 
 def lost(error: BaseException) -> bool:

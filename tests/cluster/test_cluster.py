@@ -160,7 +160,7 @@ def test_actors_share_the_worlds_and_a_checkpoint_belongs_to_no_topology(tmp_pat
 
     run, first = run_cluster(tmp_path, tiny_config(total_env_steps=1500), num_actors=3, on_iteration=look)
     told.check()
-    assert run.method._pool.num_worlds == 8
+    assert run.method._pool.config.game.num_worlds == 8
     health = run.method.health()
     assert health.num_rollouts_refused == 0
     assert num_counted(tmp_path) == health.num_rollouts_counted

@@ -71,7 +71,7 @@ def home(tmp_path_factory, champion, no_video):
 # --- a run -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", ["ours-her", "scratch-mcp", "lsd"])
+@pytest.mark.parametrize("method", ["ours-her", "lsd"])
 def test_a_killed_run_is_resumed_as_the_uninterrupted_one(tmp_path, method):
     registry, config = tmp_path / "registry", small_trial(method)
     if method == "lsd":
