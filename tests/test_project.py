@@ -21,11 +21,9 @@ HEAVY = (
 CLUSTER_MODULES = (
     "actor_pool",
     "self_play",
-    "copies",
     "ray_actors",
     "ray_task",
     "ray_connection",
-    "raylet",
     "remote_worker",
     "status_actor",
     "watch",

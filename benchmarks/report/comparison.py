@@ -13,8 +13,8 @@ from benchmarks.report.results import TRIAL, Result, by_method_and_task
 from benchmarks.reproduce import Experiment
 from service.actors.evaluation import wilson_interval
 from service.envs.tasks import TASKS
+from service.methods.task_evaluation import Rate, rate_of
 from service.methods.task_methods import METHODS
-from service.methods.task_rates import Rate, rate_of
 
 PAPER_EPISODES = 48
 """Of each of the paper's rates, most likely: nearly all are multiples of 1/48, so 16 episodes of three seeds."""

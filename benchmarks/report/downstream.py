@@ -16,8 +16,8 @@ from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
 from service.envs.tasks import HARD_TASKS, TASKS, find_task
 from service.media.figures import BLUE, FAINT, GREEN, ORANGE, new_figure, save, style_axes
+from service.methods.task_evaluation import rate_of
 from service.methods.task_methods import METHODS
-from service.methods.task_rates import rate_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,9 +12,9 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from io import UnsupportedOperation
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from io import UnsupportedOperation
 from types import TracebackType
 from typing import TYPE_CHECKING, Self, TypeVar
 

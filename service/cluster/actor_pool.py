@@ -11,10 +11,12 @@ from typing import Any
 
 import ray
 
+from service.base.types import Metrics
+from service.cluster.iteration import Round
 from service.cluster.ray_actors import Location, RolloutActor, remote_actor
 from service.cluster.watch import Clock, Watch
 from service.config.self_play import SelfPlayConfig
-from service.methods.workers import RoundSummary
+from service.envs.sampling import GoalKind
 from service.store.models import ActorStatus
 
 START_GRACE_S = 30.0
@@ -25,15 +27,15 @@ LATE_ROUNDS, LATE_S = 3.0, 2.0
 """An actor is late when its round takes this many times its recent ones, and ``LATE_S`` more."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class ActorSlot:
     """A place in the pool, and one incarnation of the actor that has it."""
 
     index: int
     incarnation: int
     handle: Any
-    spawned: float
-    """By the clock of the driver."""
+    starting: Any
+    """Reference to its location, which comes when it has started; None from then on."""
     watch: Watch
     may_start_s: float = RESTART_S
     """Time from which on it is started anew."""
@@ -42,14 +44,12 @@ class ActorSlot:
     last_error: str | None = None
     location: Location | None = None
     """None until it has started."""
-    ticket: int | None = None
-    """Rollout slot of the round it plays."""
-    round_started: float = 0.0
-    """``time.monotonic()``."""
+    round: Round | None = None
+    """The round it plays."""
     rounds_s: deque[float] = field(default_factory=lambda: deque(maxlen=10))
     """Durations of its last rounds."""
-    num_evaluations: int = 0
-    """Evaluations that it was asked for and has not answered."""
+    evaluations: list[Any] = field(default_factory=list)
+    """References to evaluations that it was asked for and has not answered."""
     late: bool = False
     """Whether updates go on without the round it plays."""
 
@@ -59,38 +59,62 @@ class ActorSlot:
         return self.location is not None
 
     @property
-    def idle(self) -> bool:
-        """Whether it has started and plays no round."""
-        return self.alive and self.ticket is None
+    def waits(self) -> bool:
+        """Whether it has not started for long: it waits for a free core."""
+        return not self.alive and self.watch.call_s >= START_GRACE_S
 
-    def start_round(self, ticket: int) -> None:
-        """Note that it was given a round."""
-        self.ticket, self.round_started = ticket, time.monotonic()
+    def look(self) -> str | None:
+        """Look after it; returns in a few words why it hangs, in a call or while it starts, if it does."""
+        if self.alive:
+            return self.watch.look()
+        waited_s = self.watch.call_s
+        return f"it did not start for {waited_s:.0f} s" if waited_s > self.may_start_s else None
+
+    def start_round(self, version: int, weights: Any, snapshot: Any, opponents: Any, num_rounds: int) -> None:
+        """Give it a round, which takes references; see ``RolloutWorker.play``."""
+        references = self.handle.play_round.remote(weights, snapshot, opponents, num_rounds)
+        self.round = Round(version, weights, *references)
         self.watch.begin()
 
-    def finish_round(self, summary: RoundSummary) -> None:
-        """Note that it has played its round."""
-        self.ticket, self.late = None, False
-        self.rounds_s.append(time.monotonic() - self.round_started)
+    def finish_round(self) -> Round:
+        """Take the round that it has played.
+
+        Raises:
+            Exception: whatever happened on another machine.
+        """
+        assert self.round is not None
+        played, self.round, self.late = self.round, None, False
+        self.watch.end()
+        played.summary = ray.get(played.answer)
+        seconds = time.monotonic() - played.started
+        played.hand_over_s = seconds - played.summary.play_s
+        self.rounds_s.append(seconds)
         self.num_rollouts += 1
-        self.num_env_steps += summary.num_env_steps
-        self.watch.end()
+        self.num_env_steps += played.summary.num_env_steps
+        return played
 
-    def start_evaluation(self) -> None:
-        """Note that it was asked to evaluate Bob, which it does before the next round."""
-        self.num_evaluations += 1
+    def start_evaluation(self, weights: Any, kind: GoalKind) -> None:
+        """Ask it to evaluate Bob, which it does before the next round."""
+        self.evaluations.append(self.handle.evaluate.remote(weights, [kind]))
         self.watch.begin()
 
-    def finish_evaluation(self) -> None:
-        """Note that it has; only now its round begins."""
-        self.num_evaluations -= 1
-        self.round_started = time.monotonic()
+    def finish_evaluation(self, reference: Any) -> Metrics:
+        """Take an evaluation; only now its round begins.
+
+        Raises:
+            Exception: whatever happened on another machine.
+        """
+        self.evaluations.remove(reference)
+        if self.round is not None:
+            self.round.started = time.monotonic()
         self.watch.end()
+        found: Metrics = ray.get(reference)
+        return found
 
     @property
     def overdue(self) -> bool:
         """Whether its round takes far longer than its last ones did; of its first one that is not known."""
-        if self.ticket is None or self.num_evaluations or not self.rounds_s:
+        if self.round is None or self.evaluations or not self.rounds_s:
             return False
         return self.watch.call_s > LATE_ROUNDS * median(self.rounds_s) + LATE_S
 
@@ -112,9 +136,7 @@ class ActorPool:
     """
 
     def __init__(self, config: SelfPlayConfig, num_threads: int, first_incarnation: int, clock: Clock) -> None:
-        self.num_worlds = config.game.num_worlds
-        """Worlds of each actor."""
-        self._config, self._num_threads, self._clock = config, num_threads, clock
+        self.config, self._num_threads, self._clock = config, num_threads, clock
         self._slots: dict[int, ActorSlot] = {}
         self._incarnations: dict[int, int] = defaultdict(lambda: first_incarnation)
         """The next incarnation of every place; one that goes and comes again begins no rollout id anew."""
@@ -127,6 +149,18 @@ class ActorPool:
         return len(self._slots)
 
     @property
+    def next_incarnation(self) -> int:
+        """Above that of all actors so far."""
+        return max(self._incarnations.values())
+
+    @property
+    def awaited(self) -> list[Any]:
+        """References to everything that its actors have yet to answer."""
+        starting = [slot.starting for slot in self if not slot.alive]
+        rounds = [slot.round.answer for slot in self if slot.round is not None]
+        return [*starting, *rounds, *(each for slot in self for each in slot.evaluations)]
+
+    @property
     def num_alive(self) -> int:
         """Actors that have started."""
         return sum(slot.alive for slot in self)
@@ -134,35 +168,22 @@ class ActorPool:
     @property
     def num_counted_on(self) -> int:
         """Actors that have started, or may any moment, and are not late; at least 1: so many rollouts of an update."""
-        now = self._clock.now
-        return max(1, sum(not slot.late if slot.alive else now - slot.spawned < START_GRACE_S for slot in self))
+        return max(1, sum(not (slot.late or slot.waits) for slot in self))
 
     @property
-    def late(self) -> list[ActorSlot]:
-        """Slots whose round updates do not wait for."""
-        return [slot for slot in self if slot.late]
+    def rounds(self) -> list[Round]:
+        """Rounds being played that updates wait for."""
+        return [slot.round for slot in self if slot.round is not None and not slot.late]
 
-    @property
-    def num_waiting(self) -> int:
-        """Actors that have not started for long."""
-        now = self._clock.now
-        return sum(not slot.alive and now - slot.spawned >= START_GRACE_S for slot in self)
-
-    def resize(self, num: int) -> list[ActorSlot]:
-        """Have ``num`` slots: new ones get an actor, and of too many those go that wait for a core.
-
-        Returns:
-            The new slots.
-        """
+    def resize(self, num: int) -> None:
+        """Have ``num`` slots: new ones get an actor, and of too many those go that wait for a core."""
         for index in sorted(self._slots, reverse=True):
             if len(self._slots) > num and not self._slots[index].alive:
                 ray.kill(self._slots.pop(index).handle)
         free = [index for index in range(num) if index not in self._slots]
-        new = [self._spawn(index) for index in free[: max(0, num - len(self._slots))]]
-        self._slots |= {slot.index: slot for slot in new}
-        return new
+        self._slots |= {index: self._spawn(index) for index in free[: max(0, num - len(self._slots))]}
 
-    def replace(self, slot: ActorSlot, reason: str) -> ActorSlot:
+    def replace(self, slot: ActorSlot, reason: str) -> None:
         """Kill a slot's actor and spawn the next incarnation."""
         ray.kill(slot.handle)
         new = self._spawn(slot.index)
@@ -170,23 +191,6 @@ class ActorPool:
         if not slot.alive:
             new.may_start_s = 2.0 * slot.may_start_s
         self._slots[slot.index] = new
-        return new
-
-    def holds(self, slot: ActorSlot) -> bool:
-        """Whether this very incarnation is still in the pool."""
-        return self._slots.get(slot.index) is slot
-
-    def hung(self) -> list[tuple[ActorSlot, str]]:
-        """Slots whose actor hangs, in a call or while it starts, and why."""
-        reasons = [(slot, slot.watch.look() if slot.alive else self._late_start(slot)) for slot in self]
-        return [(slot, reason) for slot, reason in reasons if reason is not None]
-
-    def become_late(self) -> list[ActorSlot]:
-        """Find actors whose round is overdue; from now on they are late."""
-        new = [slot for slot in self if slot.overdue and not slot.late]
-        for slot in new:
-            slot.late = True
-        return new
 
     def close(self) -> None:
         """Kill all actors."""
@@ -197,9 +201,6 @@ class ActorPool:
     def _spawn(self, index: int) -> ActorSlot:
         incarnation = self._incarnations[index]
         self._incarnations[index] = incarnation + 1
-        handle = self._actor.remote(self._config, index, incarnation, self._num_threads)
-        return ActorSlot(index, incarnation, handle, self._clock.now, Watch(handle.progress.remote, self._clock))
-
-    def _late_start(self, slot: ActorSlot) -> str | None:
-        waited_s = self._clock.now - slot.spawned
-        return f"it did not start for {waited_s:.0f} s" if waited_s > slot.may_start_s else None
+        handle = self._actor.remote(self.config, index, incarnation, self._num_threads)
+        watch = Watch(handle.progress.remote, self._clock)
+        return ActorSlot(index, incarnation, handle, handle.ping.remote(), watch)

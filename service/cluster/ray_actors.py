@@ -10,7 +10,6 @@ import os
 import socket
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import ray
@@ -19,26 +18,24 @@ from ray.util.metrics import Counter, Histogram
 import service.cluster.worker_variables  # noqa: F401  before NumPy and MuJoCo are imported  # isort: split
 from service.actors.rollout import Rollout
 from service.base.liveness import count_work, work_done
-from service.base.types import Arrays
+from service.base.types import Arrays, Metrics
 from service.config.self_play import SelfPlayConfig
 from service.generator.opponents import Opponents
 from service.generator.records import GoalSummary
 from service.generator.snapshot import GeneratorSnapshot
-from service.methods.workers import (
-    GeneratorResult,
-    GeneratorWorker,
-    LearnerWorker,
-    RolloutWorker,
-    RoundSummary,
-    UpdateResult,
-)
+from service.methods.method import Iteration
+from service.methods.workers import GeneratorWorker, RolloutWorker, RoundSummary
 from service.store.models import GoalGrid
 
 if TYPE_CHECKING:
+    from service.learner.learner import Learner
     from service.learner.weights import Weights
 
 NICENESS = 10
-"""Of workers that compute, above that of processes that answer: a tenth of the share of a core that both want."""
+"""Of workers that compute all the time, above that of processes that answer: driver, status service, Redis, Ray itself.
+
+They get a tenth of the share of a core that both want. Threads inherit it, so it is set before they are started.
+"""
 
 
 QUIET = {"enable_task_events": False}
@@ -47,26 +44,8 @@ PROBE_GROUP = {"probe": 1}
 """Concurrency groups of all workers: a thread beside the one that works, which answers ``progress``."""
 
 
-@dataclass(frozen=True, slots=True)
-class Location:
-    """The host and process of a worker."""
-
-    node: str
-    pid: int
-
-    @classmethod
-    def here(cls) -> Location:
-        """The location of this process."""
-        return cls(socket.gethostname(), os.getpid())
-
-
-def lower_priority() -> None:
-    """Put a process that computes all the time behind those that answer: driver, status service, Redis, Ray itself.
-
-    To be called before threads are started; they inherit it.
-    """
-    if hasattr(os, "nice"):
-        os.nice(NICENESS)
+Location = dict[str, Any]
+"""The host and process of a worker: ``node`` and ``pid``."""
 
 
 def remote_actor(kind: type[Watched], **options: Any) -> Any:
@@ -80,7 +59,7 @@ class Watched:
 
     def ping(self) -> Location:
         """The worker's location."""
-        return Location.here()
+        return {"node": socket.gethostname(), "pid": os.getpid()}
 
     @ray.method(concurrency_group="probe")
     def progress(self) -> int:
@@ -92,10 +71,11 @@ class RolloutActor(RolloutWorker, Watched):
     """A rollout worker in a process of its own."""
 
     def __init__(self, config: SelfPlayConfig, actor: int, incarnation: int, num_threads: int) -> None:
-        lower_priority()
+        os.nice(NICENESS)
         super().__init__(config, actor, incarnation, num_threads=num_threads)
         self._count = _round_counters(actor)
 
+    @ray.method(num_returns=3)
     def play_round(
         self, weights: Weights, snapshot: GeneratorSnapshot, opponents: Opponents, num_rounds: int
     ) -> tuple[Rollout, GoalSummary, RoundSummary]:
@@ -108,59 +88,75 @@ class RolloutActor(RolloutWorker, Watched):
 class GeneratorActor(GeneratorWorker, Watched):
     """A task generator that hands its whole state back with every record."""
 
-    def start(self, references: Sequence[Any]) -> Location:
-        """Continue from a state, given as the only one of the object references; see ``RemoteWorker``."""
+    @ray.method(num_returns=4)
+    def start(self, references: Sequence[Any]) -> tuple[Location, Arrays, GeneratorSnapshot, Opponents]:
+        """Continue from a state, given as the only one of the object references.
+
+        Returns:
+            Where it is, and its state, snapshot and past players before the next iteration.
+        """
         (state,) = _fetch(references)
         if state is not None:
             self.generator.load_state(state)
-        return self.ping()
+        return self.ping(), self.generator.state(), self.generator.snapshot(), self.opponents()
 
-    def begin(self) -> tuple[Arrays, GeneratorSnapshot, Opponents]:
-        """State, snapshot and past players before the first iteration."""
-        return self.generator.state(), self.generator.snapshot(), self.opponents()
-
+    @ray.method(num_returns=4)
     def record_from(
         self, iteration: int, num_env_steps: int, weights: Weights, references: Sequence[Any]
-    ) -> tuple[tuple[GeneratorResult, GoalGrid], Arrays, GeneratorSnapshot, Opponents | None]:
+    ) -> tuple[tuple[Iteration, GoalGrid, bool, bool], Arrays, GeneratorSnapshot, Opponents | None]:
         """Learn from an iteration's goals, given as object references; see ``GeneratorWorker.record``.
 
         Returns:
-            The result with the goal grid after it, the generator's whole state, a snapshot for the next rounds, and
-            the past players if there are others than before.
+            Its part of the iteration with the goal grid after it, whether the run should stop and whether there are
+            other past players; the generator's whole state, a snapshot for the next rounds, and those past players.
         """
-        result = self.record(iteration, weights, _fetch(references))
-        opponents = self.opponents() if result.new_opponents else None
-        grid = self.grid(iteration + 1, num_env_steps)
-        return (result, grid), self.generator.state(), self.generator.snapshot(), opponents
+        before = self.opponents().version
+        recorded = self.record(iteration, weights, _fetch(references))
+        opponents = self.opponents()
+        has_new = opponents.version != before
+        answer = recorded, self.grid(iteration + 1, num_env_steps), self.generator.should_stop(), has_new
+        return answer, self.generator.state(), self.generator.snapshot(), opponents if has_new else None
 
 
 class LearnerActor(Watched):
     """The learner, which hands its whole state back with every update."""
 
+    _learner: Learner
+
     def __init__(self, config: SelfPlayConfig) -> None:
-        lower_priority()
+        os.nice(NICENESS)
         self._config = config
 
-    def start(self, references: Sequence[Any]) -> Location:
-        """Continue from a state, given as the only one of the object references; see ``RemoteWorker``.
+    @ray.method(num_returns=3)
+    def start(self, references: Sequence[Any]) -> tuple[Location, Weights, Arrays]:
+        """Continue from a state, given as the only one of the object references.
+
+        Returns:
+            Where it is, and its weights and state before the next update.
 
         Raises:
             LearnerError: the state does not fit, or a device is not there.
         """
+        from service.learner.learner import Learner  # torch, which no other worker needs
+
         (state,) = _fetch(references)
-        self._worker = LearnerWorker(self._config, state)
-        return self.ping()
+        self._learner = Learner(self._config)
+        if state is not None:
+            self._learner.load_state(state)
+        return self.ping(), self._learner.weights(), self._learner.state()
 
-    def begin(self) -> tuple[Weights, Arrays]:
-        """Weights and state before the first update."""
-        return self._worker.learner.weights(), self._worker.learner.state()
+    @ray.method(num_returns=3)
+    def update_from(self, references: Sequence[Any]) -> tuple[tuple[Metrics, list[bool]], Weights, Arrays]:
+        """Learn from rollouts, given as object references; see ``Learner.update``.
 
-    def update_from(self, references: Sequence[Any]) -> tuple[UpdateResult, Weights, Arrays]:
-        """Learn from rollouts, given as object references; see ``LearnerWorker.update``."""
+        Returns:
+            Metrics and whether each rollout was learned from, then the weights and the whole state after it.
+        """
         start = time.perf_counter()
-        result = self._worker.update(_fetch(references))
-        weights, state = self.begin()
-        return replace(result, update_s=time.perf_counter() - start), weights, state  # all that an actor waits for
+        taken = [self._learner.ingest(rollout) for rollout in _fetch(references)]
+        metrics = self._learner.update()
+        weights, state = self._learner.weights(), self._learner.state()
+        return (metrics | {"time/learn_s": time.perf_counter() - start}, taken), weights, state
 
 
 def _fetch(references: Sequence[Any]) -> list[Any]:

@@ -21,14 +21,15 @@ from service.runs.signals import InterruptError, StopSignals
 from service.status.ports import DEFAULT_PORT
 
 CONNECT_S = 5.0
-ANSWER_S = 20.0
-"""Time that the head of a cluster has to answer; Ray itself waits as long."""
 _CLUSTERS_VARIABLE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 """With 0 a Ray has one machine, and every port that it opens is on loopback; on Linux, too, despite the name."""
 START_ATTEMPTS = 3
 """Ray gives up on a node of its own after 30 s, which a busy machine may need."""
 
-_NOBODY = "no Ray cluster answers there: is it up (ray status), and is the address right (ray start prints it)"
+_NO_ANSWER = (
+    "no Ray cluster answers there: is it up (ray status), is the address right (ray start prints it), and is its token "
+    "in RAY_AUTH_TOKEN or RAY_AUTH_TOKEN_PATH"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +96,7 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
         os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     if address is None:
         os.environ.setdefault(_CLUSTERS_VARIABLE, "0")
-        os.environ.setdefault("RAY_worker_niceness", "0")  # not 15 for all: see ``ray_actors.lower_priority``
+        os.environ.setdefault("RAY_worker_niceness", "0")  # not 15 for all: see ``ray_actors.NICENESS``
         # Else Ray gives its only node up once it was frozen for ten seconds for the fifth time; ``raylet`` watches it.
         os.environ.setdefault("RAY_health_check_failure_threshold", "1000000")
         # No spare worker for every core: a run begins no sooner with them, and may need fewer.
@@ -103,7 +104,6 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
     with needs_extra("cluster", "--runtime ray"):
         import ray
     _check_reachable(address)
-    _check_token(address)
     options: dict[str, Any] = {"num_cpus": num_cpus, "include_dashboard": False} if address is None else {}
     with StopSignals() as signals:
         wait = partial(answer, "stopping once Ray has started; again to end now")  # else some processes of its stay
@@ -153,7 +153,7 @@ def explaining_ray_errors() -> Iterator[None]:
         if isinstance(error, OSError) and (type(error) is not OSError or error.errno is not None):  # none of Ray's
             raise
         raise WorkersError(
-            f"Ray gave up: {_last_line(error)}; see ray status, and continue with --resume from what was saved"
+            f"Ray gave up: {last_line(error)}; see ray status, and continue with --resume from what was saved"
         ) from error
 
 
@@ -170,39 +170,8 @@ def _check_reachable(address: str | None) -> None:
         raise WorkersError(_explained(address, error)) from None
 
 
-def _check_token(address: str | None) -> None:
-    """Ask the cluster for its id, which needs the right token; Ray itself tries for 20 s, without a reason."""
-    if address is None or address.startswith("ray://"):
-        return
-    import grpc
-    from ray._private.grpc_utils import init_grpc_channel
-    from ray._private.services import canonicalize_bootstrap_address
-
-    try:
-        place = canonicalize_bootstrap_address(address)
-        if place is None:
-            return
-        with init_grpc_channel(place) as channel:
-            channel.unary_unary("/ray.rpc.NodeInfoGcsService/GetClusterId")(b"", timeout=ANSWER_S)
-        return
-    except grpc.RpcError as error:
-        code, said = error.code(), f" It says: {one_line(str(error.details()), 300)}"
-    except Exception:  # no token at all, no cluster of that name: Ray says so at once
-        return
-    if code == grpc.StatusCode.UNAUTHENTICATED:
-        sent = os.environ.get("RAY_AUTH_MODE") == "token"
-        what = "it refuses the token that was sent" if sent else "it wants a token, and none was sent"
-        mode = "" if sent else "RAY_AUTH_MODE=token, and "
-        raise WorkersError(
-            f"--address {address}: {what}: set {mode}RAY_AUTH_TOKEN or RAY_AUTH_TOKEN_PATH to the one that the cluster "
-            f"was started with.{said}"
-        )
-    if code in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED):
-        raise WorkersError(f"--address {address}: {_NOBODY}.{said}")
-
-
-def _last_line(error: Exception) -> str:
-    """What an error of Ray's says in the end, after a traceback or a table of ids."""
+def last_line(error: BaseException) -> str:
+    """An error of Ray's in a line: what it says in the end, after a traceback or a table of ids."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[-1].strip() if lines else ''}"[:200]
 
@@ -216,5 +185,5 @@ def _explained(address: str | None, error: Exception) -> str:
     elif address is None:
         what = "Ray does not start here"
     else:
-        what = _NOBODY
+        what = _NO_ANSWER
     return f"--address {address or '(none)'}: {what}. It says: {one_line(said, 300)}"

@@ -19,7 +19,7 @@ from service.store.address import address_from_environment
 from service.store.disk_reader import run_id_of
 
 if TYPE_CHECKING:
-    from service.cluster.raylet import RayletWatch
+    from service.cluster.watch import RayletWatch
 
 _logger = logging.getLogger(__name__)
 
@@ -56,8 +56,8 @@ class RayRuntime(Runtime):
     @contextmanager
     def around(self, directory: Path, registry: Path, end_now: Callable[[str], None]) -> Iterator[None]:
         """Watch over the raylet of this machine, and serve the run's status."""
-        from service.cluster.raylet import RayletWatch
         from service.cluster.status_actor import serving
+        from service.cluster.watch import RayletWatch
 
         with ExitStack() as stack:
             stack.enter_context(explaining_ray_errors())

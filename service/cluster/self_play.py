@@ -3,7 +3,7 @@
 | process | consumes | produces | waits for | bounded by |
 |---|---|---|---|---|
 | driver, ``RaySelfPlay`` | results of the others | calls, iterations, states | next result, ``POLL_S`` at most | - |
-| rollout actors x N | weights, snapshot, opponents | a rollout, a goal summary | nothing | ``RolloutSlots`` |
+| rollout actors x N | weights, snapshot, opponents | a rollout, a goal summary | nothing | ``may_begin`` |
 | learner | rollouts of one iteration | weights, its state, metrics | nothing | one update at a time |
 | task generator | goal summaries of one iteration | snapshot, opponents, its state | nothing | one record at a time |
 
@@ -24,31 +24,26 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 import ray
-from ray.exceptions import ObjectLostError, RayError
+from ray.exceptions import ObjectLostError, RayError, RayTaskError
 
 from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import from_arrays
 from service.base.errors import DivergedError
-from service.base.types import Arrays, Metrics
+from service.base.types import Metrics
 from service.cluster.actor_pool import ActorPool, ActorSlot
-from service.cluster.copies import Copies
-from service.cluster.iteration import OpenIteration, PendingRollout
+from service.cluster.iteration import OpenIteration, Round, may_begin, may_update
 from service.cluster.ray_actors import GeneratorActor, LearnerActor, remote_actor
-from service.cluster.ray_connection import ClusterOptions
-from service.cluster.raylet import RayletWatch
-from service.cluster.remote_worker import POLL_S, START_S, RemoteWorker, lost, one_line, pause, wait_for
-from service.cluster.slots import RolloutSlots
-from service.cluster.watch import Clock, Watch
+from service.cluster.ray_connection import ClusterOptions, last_line
+from service.cluster.remote_worker import POLL_S, RemoteWorker, lost
+from service.cluster.watch import Clock, RayletWatch
 from service.config.self_play import SelfPlayConfig
 from service.learner.weights import MAX_POLICY_LAG
 from service.methods.method import Health, Iteration, State, StateLostError, WorkersError
-from service.methods.self_play import IterationResult, LocalSelfPlay, SelfPlay
-from service.methods.workers import RoundSummary
+from service.methods.self_play import LocalSelfPlay, SelfPlay
 from service.policies.parameters import Parameters, PolicyError
 from service.registry.loading import Trained
 from service.store.models import GoalGrid
@@ -59,8 +54,6 @@ RESIZE_S = 5.0
 """Time between two looks at the size of the cluster."""
 MAX_ATTEMPTS = 3
 """Learners or generators in a row that may die of the same iteration."""
-RETRY_S = 1.0
-"""Pause before the second of them is asked; it doubles."""
 MAX_FAILED_ROUNDS = 20
 """Rounds, or starts of actors, in a row that may fail."""
 
@@ -78,6 +71,8 @@ class RaySelfPlay(SelfPlay):
         raylet: watch over that of this machine; None where there is none.
     """
 
+    _pool: ActorPool
+
     def __init__(
         self,
         config: SelfPlayConfig,
@@ -87,22 +82,20 @@ class RaySelfPlay(SelfPlay):
     ) -> None:
         super().__init__(config)
         self._options, self._start_from, self._raylet, self._clock = options, start_from, raylet, Clock()
-        self._waiting: dict[Any, Callable[[Any], None]] = {}
-        self._copies = Copies()
-        self._slots = RolloutSlots()
-        self._pending: list[PendingRollout] = []
+        self._pending: list[Round] = []
+        """Rounds that are played and not learned from."""
         self._carried: list[Any] = []
         """References to rollouts of an earlier process, to be learned from with the first ones."""
         self._current: OpenIteration | None = None
-        self._ended: Iteration | None = None
+        self._copies: dict[Any, Any] = {}
+        """Copies of what the next workers begin with, by reference; None until it is at this node."""
         self._evaluated: Metrics = {}
         self._grid: GoalGrid | None = None
         self._num_failed_rounds = self._num_counted = self._num_refused = 0
         self._last_error: str | None = None
-        self._last_iteration = self._last_resize = time.monotonic()
-        self._first_incarnation = 0
-        self._next_incarnation = 1
-        self._states: dict[str, Arrays | None] = {"learner": None, "generator": None}
+        self._version = 0
+        self._begun: State = {}
+        """What the workers begin with; empty where it is nothing."""
         self._to_close: list[Callable[[], None]] = []
 
     def start(self, state: State | None = None) -> None:
@@ -122,40 +115,40 @@ class RaySelfPlay(SelfPlay):
         learner = remote_actor(LearnerActor, num_cpus=options.learner_cpus, num_gpus=num_gpus(device))
         self._learner = self._worker("learner", learner)
         self._generator = self._worker("generator", remote_actor(GeneratorActor, num_cpus=0))
-        self._states.clear()
         self._learner.start()
         self._generator.start()
-        self._weights, self._learner.state = self._begin(self._learner, 2)
-        self._generator.state, self._snapshot, self._opponents = self._begin(self._generator, 3)
-        self._version: int = ray.get(self._weights).version
-        self._keep_copies()
-        self._pool = self._start_actors(self._first_incarnation)
+        self._hand_out(has_new_opponents=True)
+        self._version = _fetch(self._weights).version
+        num = self._num_actors()
+        game = self.config.game.model_copy(update={"num_worlds": -(-self.config.game.num_worlds // num)})
+        config = self.config.model_copy(update={"game": game})
+        first_incarnation = int(self._begun.get("next_incarnation", 0))
+        self._begun = {}
+        self._pool = ActorPool(config, options.actor_threads, first_incarnation, self._clock)
         self._to_close.append(self._pool.close)
-        self._last_iteration = time.monotonic()
+        self._pool.resize(num)
+        self._last_iteration = self._last_resize = time.monotonic()
 
     def step(self) -> Iteration | None:
         """Wait for a worker for a moment; the iteration that has ended meanwhile, if any."""
-        self._ended = None
         self._start_iteration()
         self._start_rounds()
         with self.timing("wait"):
-            ray.wait(list(self._waiting), timeout=POLL_S)
-            # All that is there, before anybody is called late or hung: after a pause that may be everything.
-            ready, _ = ray.wait(list(self._waiting), num_returns=len(self._waiting), timeout=0)
-        for reference in ready:
-            self._waiting.pop(reference)(reference)
+            ready = self._wait()
+        self._take_copies(ready)
+        for slot in list(self._pool):
+            self._take_from_actor(slot, ready)
+        ended = self._take_iteration(ready)
         if self._raylet is None or not self._raylet.silent:  # else they may all wait for it
             self._clock.look()
             self._check_workers()
-        return self._ended
+        return ended
 
     def evaluate(self) -> Metrics:
         """Ask actors for one kind of goals each; the success is in the metrics of a later iteration."""
         alive = [slot for slot in self._pool if slot.alive]
         for index, kind in enumerate(EVALUATED_GOALS if alive else ()):
-            slot = alive[index % len(alive)]
-            slot.start_evaluation()
-            self._waiting[slot.handle.evaluate.remote(self._weights, [kind])] = partial(self._on_evaluation, slot)
+            alive[index % len(alive)].start_evaluation(self._weights, kind)
         return {}
 
     def parameters(self) -> Parameters:
@@ -165,14 +158,13 @@ class RaySelfPlay(SelfPlay):
 
     def health(self) -> Health:
         """The state of all its workers."""
-        waiting = self._pool.num_waiting
-        lack: tuple[str, ...] = (
-            (f"{waiting} of {len(self._pool)} rollout actors wait for a free core",) if waiting else ()
-        )
-        if late := ", ".join(f"rollout-{slot.index}" for slot in self._pool.late):
-            lack += (f"{late}: late; updates go on without",)
+        lack: list[str] = []
+        if waiting := sum(slot.waits for slot in self._pool):
+            lack.append(f"{waiting} of {len(self._pool)} rollout actors wait for a free core")
+        if late := ", ".join(f"rollout-{slot.index}" for slot in self._pool if slot.late):
+            lack.append(f"{late}: late; updates go on without")
         actors = (*(slot.status() for slot in self._pool), self._learner.status(), self._generator.status())
-        return Health(actors, self._num_counted, self._num_refused, lack, self._last_error)
+        return Health(actors, self._num_counted, self._num_refused, tuple(lack), self._last_error)
 
     def grid(self) -> GoalGrid | None:
         """The task generator's goal grid after the last iteration; None before the first."""
@@ -187,17 +179,15 @@ class RaySelfPlay(SelfPlay):
             "generator": generator,
             "alice": weights.alice,  # for readers without torch
             "bob": weights.bob_ema,
-            "next_incarnation": self._next_incarnation,
+            "next_incarnation": self._pool.next_incarnation,
             "rng": rng.bit_generator.state,
         }
 
     def load_state(self, state: State) -> None:
         """Let the workers, which have not started, begin with a state of any origin."""
-        self._states = {"learner": state["learner"], "generator": state["generator"]}
+        self._begun = state
         if "pending" in state:
             self._carried = [ray.put(from_arrays(state["pending"]))]
-        self._first_incarnation = int(state["next_incarnation"])
-        self._next_incarnation = self._first_incarnation + 1
 
     def close(self) -> None:
         """End all workers."""
@@ -206,214 +196,176 @@ class RaySelfPlay(SelfPlay):
         self._to_close.clear()
 
     def _worker(self, name: str, actor: Any) -> RemoteWorker:
-        worker = RemoteWorker(name, actor, self.config, self._states[name], self._clock, self._wait)
+        worker = RemoteWorker(name, actor, self.config, self._begun.get(name), self._clock, lambda: self.on_wait())
         self._to_close.append(worker.close)
         return worker
 
-    def _wait(self) -> None:
-        self.on_wait()
+    def _wait(self) -> set[Any]:
+        """Wait a moment for the next answer; references to all that are there."""
+        workers = [worker.answer for worker in (self._learner, self._generator) if worker.answer is not None]
+        copies = [reference for reference, value in self._copies.items() if value is None]
+        awaited = [*self._pool.awaited, *workers, *copies]
+        ray.wait(awaited, timeout=POLL_S)
+        # All that is there, before any worker is called late or hung: after a pause that may be everything.
+        ready, _ = ray.wait(awaited, num_returns=len(awaited), timeout=0)
+        return set(ready)
 
     # --- rounds ----------------------------------------------------------------------------------------------------
 
     def _start_rounds(self) -> None:
-        """Give every idle actor a round, as far as there are rollout slots."""
+        """Give every idle actor a round, as far as the policy lag allows it."""
+        num, learned_from = self._pool.num_counted_on, self._current.batch if self._current is not None else []
         for slot in self._pool:
-            if slot.idle and self._slots.may_begin(self._pool.num_counted_on):
-                self._start_round(slot)
+            num_on_the_way = len(self._pool.rounds) + len(self._pending) + len(learned_from)
+            if slot.alive and slot.round is None and may_begin(num_on_the_way, num):
+                slot.start_round(self._version, self._weights, self._snapshot, self._opponents, num)
 
-    def _start_round(self, slot: ActorSlot) -> None:
-        ticket = self._slots.begin(self._version)
-        play = slot.handle.play_round.options(num_returns=3)
-        num_rounds = self._pool.num_counted_on
-        rollout, goals, summary = play.remote(self._weights, self._snapshot, self._opponents, num_rounds)
-        slot.start_round(ticket)
-        pending = partial(PendingRollout, ticket, self._version, rollout, goals, self._weights)
-        self._waiting[summary] = partial(self._on_round, slot, ticket, pending)
-
-    def _on_round(self, slot: ActorSlot, ticket: int, pending: Callable[..., PendingRollout], reference: Any) -> None:
-        if not self._pool.holds(slot):
-            return  # it was replaced meanwhile, and its ticket given back
+    def _take_from_actor(self, slot: ActorSlot, ready: set[Any]) -> None:
+        """Take what an actor has answered; one that has failed is replaced, and the round it played is lost."""
         try:
-            summary: RoundSummary = ray.get(reference)
+            if slot.starting in ready:
+                slot.location, slot.starting = ray.get(slot.starting), None
+                if slot.incarnation > 0:
+                    _logger.info("rollout actor %d is back, as its incarnation %d", slot.index, slot.incarnation)
+            for reference in ready.intersection(slot.evaluations):
+                self._evaluated |= slot.finish_evaluation(reference)
+            if slot.round is not None and slot.round.answer in ready:
+                self._pending.append(slot.finish_round())
+                self._num_failed_rounds = 0
+        except (DivergedError, PolicyError):
+            raise
         except Exception as error:  # whatever happened on another machine
-            self._on_failed_round(slot, ticket, error)
-            return
-        self._num_failed_rounds = 0
-        slot.finish_round(summary)
-        self._slots.finish(ticket)
-        self._pending.append(pending(summary, time.monotonic() - slot.round_started - summary.play_s))
-
-    def _on_failed_round(self, slot: ActorSlot, ticket: int, error: Exception) -> None:
-        """Replace the actor, unless the run as a whole cannot go on."""
-        if isinstance(error, (DivergedError, PolicyError)):
-            raise error
-        if lost(error):
-            raise StateLostError(f"weights or goals went with the machine that kept them ({one_line(error)})") from None
-        self._slots.lose(ticket)
-        self._on_failed_actor(slot, one_line(error))
-
-    def _on_failed_actor(self, slot: ActorSlot, reason: str) -> None:
-        self._num_failed_rounds += 1
-        if self._num_failed_rounds > MAX_FAILED_ROUNDS:
-            raise WorkersError(f"{MAX_FAILED_ROUNDS + 1} rollout actors in a row failed, at last with: {reason}")
-        self._replace(slot, reason)
+            reason = last_line(error)
+            if lost(error):
+                raise StateLostError(f"weights or goals went with the machine that kept them ({reason})") from None
+            self._num_failed_rounds += 1
+            if self._num_failed_rounds > MAX_FAILED_ROUNDS:
+                raise WorkersError(
+                    f"{MAX_FAILED_ROUNDS + 1} rollout actors in a row failed, at last with: {reason}"
+                ) from None
+            self._replace(slot, reason)
 
     def _replace(self, slot: ActorSlot, reason: str) -> None:
         _logger.warning("rollout actor %d is gone (%s); another takes its place", slot.index, reason)
         self._last_error = f"rollout-{slot.index}: {reason}"
-        self._await_start(self._pool.replace(slot, reason))
-
-    def _await_start(self, slot: ActorSlot) -> None:
-        self._next_incarnation = max(self._next_incarnation, slot.incarnation + 1)
-        self._waiting[slot.handle.ping.remote()] = partial(self._on_start, slot)
-
-    def _on_start(self, slot: ActorSlot, reference: Any) -> None:
-        if not self._pool.holds(slot):
-            return
-        try:
-            slot.location = ray.get(reference)
-            if slot.incarnation > 0:
-                _logger.info("rollout actor %d is back, as its incarnation %d", slot.index, slot.incarnation)
-        except RayError as error:
-            self._on_failed_actor(slot, one_line(error))
+        self._pool.replace(slot, reason)
 
     # --- iterations ------------------------------------------------------------------------------------------------
 
     def _start_iteration(self) -> None:
         """Give learner and generator what was played, if it is enough and makes no round being played too old."""
-        num = self._pool.num_counted_on
-        if self._current is not None or len(self._pending) < num or not self._slots.may_update(self._version):
+        num, played = self._pool.num_counted_on, [each.version for each in self._pool.rounds]
+        if self._current is not None or len(self._pending) < num or not may_update(self._version, played):
             return
         self._refuse_old()
         if len(self._pending) < num:
             return
         batch, self._pending = self._pending, []  # all: one that were left over would only get older
         self._current = OpenIteration(batch)
-        self._ask_generator(self._current)
-        self._ask_learner(self._current)
+        self._ask(self._generator, batch)
+        self._ask(self._learner, batch)
 
     def _refuse_old(self) -> None:
         """Leave out rollouts that came too late to be learned from."""
         for each in [each for each in self._pending if self._version - each.version > MAX_POLICY_LAG]:
             _logger.info("rollout %s came %d versions late", each.summary.id, self._version - each.version)
             self._pending.remove(each)
-            self._slots.lose(each.ticket)
             self._num_refused += 1
 
-    def _ask_learner(self, iteration: OpenIteration) -> None:
-        rollouts = [*self._carried, *(each.rollout for each in iteration.batch)]
-        updated, *others = self._learner.handle.update_from.options(num_returns=3).remote(rollouts)
-        iteration.weights, iteration.learner_state = others
-        self._learner.watch.begin()
-        self._waiting[updated] = partial(self._on_learned, iteration, self._learner.watch)
-
-    def _ask_generator(self, iteration: OpenIteration) -> None:
-        num_env_steps = self.num_env_steps + iteration.num_env_steps
-        goals = [each.goals for each in iteration.batch]
-        record = self._generator.handle.record_from.options(num_returns=4)
-        weights = iteration.batch[0].weights  # the players of this iteration may become past opponents
-        recorded, *others = record.remote(self.iteration, num_env_steps, weights, goals)
-        iteration.generator_state, iteration.snapshot, iteration.opponents = others
-        self._generator.watch.begin()
-        self._waiting[recorded] = partial(self._on_recorded, iteration, self._generator.watch)
-
-    def _on_learned(self, iteration: OpenIteration, watch: Watch, reference: Any) -> None:
-        watch.end()
-        if iteration is not self._current:
-            return  # its rollouts were all lost
-        try:
-            iteration.updated = ray.get(reference)
-        except RayError as error:
-            self._on_failed_answer(iteration, self._learner, error)
-            return
-        self._finish_if_done(iteration)
-
-    def _on_recorded(self, iteration: OpenIteration, watch: Watch, reference: Any) -> None:
-        watch.end()
-        if iteration is not self._current:
-            return  # its rollouts were all lost
-        try:
-            iteration.recorded, iteration.grid = ray.get(reference)
-        except RayError as error:
-            self._on_failed_answer(iteration, self._generator, error)
-            return
-        self._finish_if_done(iteration)
-
-    def _on_failed_answer(self, iteration: OpenIteration, worker: RemoteWorker, error: Exception) -> None:
-        """Start another learner or generator from the state before the iteration, and ask it what is left of that."""
-        is_lost = lost(error)
-        reason = one_line(error) if is_lost else worker.explain(error)
-        if is_lost:
-            self._drop_lost(iteration)
-        elif isinstance(error, (DivergedError, PolicyError)) or worker.alive:
-            raise error
+    def _ask(self, worker: RemoteWorker, batch: list[Round]) -> None:
+        """Give a batch to the learner or the task generator."""
+        if worker is self._learner:
+            worker.ask("update_from", [*self._carried, *(each.rollout for each in batch)])
         else:
-            pause(RETRY_S * 2 ** (attempt - 1) if (attempt := iteration.num_attempts[worker.name]) else 0.0, self._wait)
-            self._last_error = f"{worker.name}: {reason}"
-            worker.restart(reason)
-        iteration.num_attempts[worker.name] += 1
-        if iteration.num_attempts[worker.name] >= MAX_ATTEMPTS:
-            raise WorkersError(
-                f"{MAX_ATTEMPTS} times in a row the {worker.name} failed at the same rollouts, at last with: {reason}"
-            ) from error
-        if not iteration.batch:
-            self._current = None
-        elif worker is self._learner:
-            self._ask_learner(iteration)
-        else:
-            self._ask_generator(iteration)
+            num_env_steps = self.num_env_steps + sum(each.summary.num_env_steps for each in batch)
+            weights = batch[0].weights  # the players of this iteration may become past opponents
+            worker.ask("record_from", self.iteration, num_env_steps, weights, [each.goals for each in batch])
 
-    def _drop_lost(self, iteration: OpenIteration) -> None:
+    def _take_iteration(self, ready: set[Any]) -> Iteration | None:
+        """Take what learner and generator have answered; the iteration, once both have."""
+        if (current := self._current) is None:
+            return None
+        if self._learner.answer in ready:
+            current.updated = self._take_answer(self._learner, current)
+        if self._generator.answer in ready:
+            current.recorded = self._take_answer(self._generator, current)
+        if self._learner.answer is not None or self._generator.answer is not None:
+            return None
+        self._current = None
+        return self._finish_iteration(current) if current.batch else None  # else its rollouts were all lost
+
+    def _take_answer(self, worker: RemoteWorker, iteration: OpenIteration) -> Any:
+        """What it answers; None where it failed, and has been asked again what is left of the iteration."""
+        try:
+            return worker.take_answer()
+        except RayError as error:
+            if lost(error):
+                reason = last_line(error)
+                self._drop_lost(iteration.batch)
+            elif isinstance(error, RayTaskError):  # the worker lives, and would fail again
+                raise
+            else:  # another goes on from the state before the iteration
+                reason = worker.restart(error)
+                self._last_error = f"{worker.name}: {reason}"
+            iteration.num_attempts[worker.name] += 1
+            if iteration.num_attempts[worker.name] >= MAX_ATTEMPTS:
+                raise WorkersError(
+                    f"{MAX_ATTEMPTS} times in a row the {worker.name} failed at the same rollouts, at last with: "
+                    f"{reason}"
+                ) from error
+        if iteration.batch:
+            self._ask(worker, iteration.batch)
+        return None
+
+    def _drop_lost(self, batch: list[Round]) -> None:
         """Forget rollouts that were lost with the node that held them."""
-        for each in list(iteration.batch):
+        for each in list(batch):
             try:
                 ray.get([each.rollout, each.goals])
             except RayError as error:
-                _logger.warning("rollout %s is lost (%s)", each.summary.id, one_line(error))
-                iteration.batch.remove(each)
-                self._slots.lose(each.ticket)
+                _logger.warning("rollout %s is lost (%s)", each.summary.id, last_line(error))
+                batch.remove(each)
 
-    def _finish_if_done(self, iteration: OpenIteration) -> None:
-        """Count and record an iteration once its version is out, and give its rollout slots back."""
-        updated, recorded = iteration.updated, iteration.recorded
-        if updated is None or recorded is None:
-            return
+    def _finish_iteration(self, iteration: OpenIteration) -> Iteration:
+        """Count an iteration whose version is out."""
+        assert iteration.updated is not None
+        assert iteration.recorded is not None
+        learned, taken = iteration.updated
+        recorded, self._grid, self._converged, has_new_opponents = iteration.recorded
         now = time.monotonic()
         elapsed_s, self._last_iteration = now - self._last_iteration, now
-        self._weights, self._version = iteration.weights, updated.version
-        self._snapshot = iteration.snapshot
-        if recorded.new_opponents:
-            self._opponents = iteration.opponents
-        self._learner.state, self._generator.state = iteration.learner_state, iteration.generator_state
+        self._version = int(learned["learner/version"])
+        self._hand_out(has_new_opponents=has_new_opponents)
+        self._num_counted += sum(taken)
+        self._num_refused += len(taken) - sum(taken)
         self._carried = []
-        self._keep_copies()
-        self._slots.publish([each.ticket for each in iteration.batch])
-        self._current, self._grid = None, iteration.grid
-        self._num_counted += len(updated.counted)
-        self._num_refused += len(updated.refused)
-        result = IterationResult(
+        ended = self._finish(
             [each.summary for each in iteration.batch],
             recorded,
-            updated,
-            num_actors_alive=self._pool.num_alive,
+            learned,
             elapsed_s=elapsed_s,
+            num_alive=self._pool.num_alive,
             hand_over_s=float(np.mean([each.hand_over_s for each in iteration.batch])),
         )
         evaluated, self._evaluated = self._evaluated, {}
-        ended = self._finish(result)
-        self._ended = replace(ended, metrics=ended.metrics | evaluated)
+        return replace(ended, metrics=ended.metrics | evaluated)
 
-    def _on_evaluation(self, slot: ActorSlot, reference: Any) -> None:
-        slot.finish_evaluation()
-        try:
-            self._evaluated |= ray.get(reference)
-        except RayError as error:
-            _logger.warning("without this evaluation: %s", one_line(error))
-
-    def _keep_copies(self) -> None:
-        """Let the driver's node have what the next workers would begin with."""
+    def _hand_out(self, *, has_new_opponents: bool) -> None:
+        """Let the next rounds and workers have what learner and generator have made; copies of what is older go."""
+        self._weights, self._learner.state = self._learner.made
+        self._generator.state, self._snapshot, opponents = self._generator.made
+        if has_new_opponents:
+            self._opponents = opponents
         needed = [self._weights, self._snapshot, self._opponents, self._generator.state, self._learner.state]
-        self._waiting |= self._copies.keep(needed)
+        self._copies = {each: self._copies.get(each) for each in needed}
+
+    def _take_copies(self, ready: set[Any]) -> None:
+        """Copy to this node what can be: it outlives the node that it is from. Processes of one machine share it."""
+        for reference in self._copies.keys() & ready:
+            try:
+                self._copies[reference] = ray.get(reference)
+            except RayError:  # it went with its node, and who needs it will say so
+                del self._copies[reference]
 
     # --- looking after workers -------------------------------------------------------------------------------------
 
@@ -421,45 +373,22 @@ class RaySelfPlay(SelfPlay):
         """Go on without actors that are late, replace workers that hang, and follow the cluster's size."""
         for worker in (self._learner, self._generator):
             worker.end_if_hung()  # then its answer fails, and another takes its place
-        for slot in self._pool.become_late():
-            assert slot.ticket is not None
-            self._slots.release(slot.ticket)
-            _logger.info("rollout actor %d is late; updates go on without it", slot.index)
-        for slot, reason in self._pool.hung():
-            if slot.ticket is not None:
-                self._slots.lose(slot.ticket)
-            self._replace(slot, reason)
+        for slot in list(self._pool):
+            if slot.overdue and not slot.late:
+                slot.late = True
+                _logger.info("rollout actor %d is late; updates go on without it", slot.index)
+            if (reason := slot.look()) is not None:
+                self._replace(slot, reason)
         now = time.monotonic()
         if now - self._last_resize >= RESIZE_S:
             self._last_resize = now
-            for slot in self._pool.resize(self._num_actors()):
-                self._await_start(slot)
+            self._pool.resize(self._num_actors())
 
     def _num_actors(self) -> int:
         if self._options.num_actors is not None:
             return self._options.num_actors
         cores = ray.cluster_resources().get("CPU", 0.0) - self._options.learner_cpus
         return max(1, int(cores // self._options.actor_threads))
-
-    def _start_actors(self, first_incarnation: int) -> ActorPool:
-        num = self._num_actors()
-        game = self.config.game.model_copy(update={"num_worlds": -(-self.config.game.num_worlds // num)})
-        config = self.config.model_copy(update={"game": game})
-        pool = ActorPool(config, self._options.actor_threads, first_incarnation, self._clock)
-        for slot in pool.resize(num):
-            self._await_start(slot)
-        return pool
-
-    def _begin(self, worker: RemoteWorker, num: int) -> list[Any]:
-        """The references, so many, to what a worker has before the first iteration; it is there when this returns."""
-        for _ in range(MAX_ATTEMPTS):
-            try:
-                begun: list[Any] = worker.handle.begin.options(num_returns=num).remote()
-                wait_for(begun, START_S, self._wait)
-                return begun
-            except RayError as error:
-                worker.restart(worker.explain(error))
-        raise WorkersError(f"the {worker.name} fails as it begins, {MAX_ATTEMPTS} times in a row")
 
 
 def num_gpus(device: str) -> int:
@@ -473,4 +402,4 @@ def _fetch(state: Any) -> Any:
     try:
         return ray.get(state)
     except ObjectLostError as error:  # it went with its node, before it was copied to this one
-        raise StateLostError(f"the newest state is lost ({one_line(error)})") from None
+        raise StateLostError(f"the newest state is lost ({last_line(error)})") from None

@@ -11,13 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import ray
-from ray.exceptions import RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from service.base.errors import StatusError
 from service.cluster.ray_connection import StatusOptions
-from service.cluster.remote_worker import one_line
-from service.methods.method import WorkersError
 from service.status.ports import free_port
 from service.store.address import RedisAddress
 
@@ -96,24 +93,13 @@ def serving(options: StatusOptions, runs_dir: Path, registry: Path, redis: Redis
 
     Raises:
         StatusError: the address cannot be had, or a public one without a token.
-        WorkersError: it does not start.
+        RayError: it does not start.
     """
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
     actor = ray.remote(StatusWorker).options(num_cpus=0, max_restarts=-1, scheduling_strategy=here)
     handle: Any = actor.remote(place(options), runs_dir.absolute(), registry.absolute(), redis)
     try:
-        yield _started(handle)
+        url: str = ray.get(handle.start.remote(), timeout=START_S)
+        yield url
     finally:
         ray.kill(handle, no_restart=True)
-
-
-def _started(handle: Any) -> str:
-    try:
-        url: str = ray.get(handle.start.remote(), timeout=START_S)
-    except RayTaskError as error:
-        if isinstance(error.cause, StatusError):
-            raise error.cause from None
-        raise
-    except RayError as error:
-        raise WorkersError(f"the status service does not start: {one_line(error)}") from None
-    return url

@@ -2,6 +2,9 @@
 
 A process that is frozen does not answer. One that hangs answers, and counts no further. One on a busy machine counts
 slowly, and is left alone: a machine that gives it a fiftieth of a core is no reason to kill it.
+
+While the raylet of this machine, Ray's process for a node, is frozen, Ray does nothing here. The driver's own calls
+wait in it, too, some of them for ever. So a thread of its own asks it.
 """
 
 from __future__ import annotations
@@ -9,9 +12,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from threading import Event, Thread
+from typing import TYPE_CHECKING, Any, Self
 
 import ray
+from ray._private.grpc_utils import init_grpc_channel
 from ray.exceptions import RayError
 
 from service.store.models import ActorStatus
@@ -27,6 +32,12 @@ STALL_S = 30.0
 """A worker hangs without progress for so long."""
 FIRST_S = 120.0
 """And for so long in its first call, in which libraries are loaded and code is compiled."""
+ASK_S = 0.5
+"""Time between two questions to the raylet."""
+SILENT_S = 5.0
+"""A raylet that has not answered for so long may be frozen; until it answers, no other process is called hung."""
+LOST_S = 40.0
+"""One that has not answered for so long is given up."""
 
 
 class Clock:
@@ -66,9 +77,15 @@ class Watch:
         self, name: str, incarnation: int, location: Location | None, last_error: str | None, **counted: int
     ) -> ActorStatus:
         """The worker's state for the status service; it has no location while it starts."""
-        at = {} if location is None else {"node": location.node, "pid": location.pid}
-        own = {"name": name, "incarnation": incarnation, "last_error": last_error, "heartbeat": self.heartbeat}
-        return ActorStatus(state="starting" if location is None else "alive", **own, **at, **counted)
+        return ActorStatus(
+            name=name,
+            incarnation=incarnation,
+            state="starting" if location is None else "alive",
+            last_error=last_error,
+            heartbeat=self.heartbeat,
+            **(location or {}),
+            **counted,
+        )
 
     def begin(self) -> None:
         """Note that it was given a call."""
@@ -85,7 +102,7 @@ class Watch:
 
     @property
     def call_s(self) -> float:
-        """Time since its call began."""
+        """Time since its call began, or since the worker was made where there was none."""
         return self._clock.now - self._began
 
     def look(self) -> str | None:
@@ -111,3 +128,46 @@ class Watch:
             if count != self._count:
                 self._count, self._moved, self.heartbeat = count, self._clock.now, datetime.now(UTC)
         self._asked = self._probe()
+
+
+class RayletWatch:
+    """A context manager that asks the raylet of this node again and again whether it is well.
+
+    Args:
+        on_lost: called once, in a thread, with a line that says so when the raylet is given up.
+    """
+
+    def __init__(self, on_lost: Callable[[str], None]) -> None:
+        own = ray.get_runtime_context().get_node_id()
+        node = next(each for each in ray.nodes() if each["NodeID"] == own)
+        self._on_lost = on_lost
+        self._channel = init_grpc_channel(f"{node['NodeManagerAddress']}:{node['NodeManagerPort']}")
+        self._over = Event()
+        self.answers = False
+        """Whether it has ever answered; one that has not may be out of reach, and well."""
+        self.silent = False
+        """Whether it has not answered for some seconds."""
+        self._thread = Thread(target=self._watch, name="raylet", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._over.set()
+        self._thread.join()
+        self._channel.close()
+
+    def _watch(self) -> None:
+        ask = self._channel.unary_unary("/grpc.health.v1.Health/Check")
+        clock, answer = Clock(), ask.future(b"")
+        while not self._over.wait(ASK_S):
+            clock.look()
+            if answer.done():
+                if answer.exception() is None:
+                    clock, self.answers = Clock(), True
+                answer = ask.future(b"")
+            self.silent = self.answers and clock.now > SILENT_S
+            if self.answers and clock.now > LOST_S:
+                self._on_lost(f"Ray's process for this machine, the raylet, has not answered for {clock.now:.0f} s")
+                return

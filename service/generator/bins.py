@@ -8,7 +8,6 @@ from service.base.types import Array, BoolArray, IntArray, StateArray
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
 from service.envs.state_layout import StateLayout, obstacle_columns
-from service.store.models import GoalCell, GoalGrid
 
 AIR_ABOVE_REST_M = 0.05
 """A goal is in the air when the object's centre is higher than it rests on the table by more than this."""
@@ -76,38 +75,6 @@ class GoalCells:
         index = np.stack(np.unravel_index(np.arange(len(self)), self.shape), axis=-1)
         centers: Array = self._lower + (index + 0.5) * self.cell_size_m
         return centers
-
-    def grid(
-        self,
-        shown: BoolArray,
-        num_tries: IntArray,
-        success_rate: StateArray,
-        learnability: StateArray,
-        *,
-        iteration: int,
-        num_env_steps: int,
-    ) -> GoalGrid:
-        """The cells that are ``shown`` as people and the service read them; all arrays are (cells,)."""
-        centers = np.round(self.centers(), 4)
-        cells = tuple(
-            GoalCell(
-                center_m=tuple(centers[cell].tolist()),
-                num_tries=int(num_tries[cell]),
-                success_rate=float(success_rate[cell]),
-                learnability=float(learnability[cell]),
-            )
-            for cell in np.flatnonzero(shown)
-        )
-        return GoalGrid(
-            iteration=iteration,
-            num_env_steps=num_env_steps,
-            cell_size_m=self.cell_size_m,
-            shape=self.shape,
-            num_cells=len(self),
-            lower_m=self.bounds_m[0],
-            upper_m=self.bounds_m[1],
-            cells=cells,
-        )
 
 
 class TaskBins:

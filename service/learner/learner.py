@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -46,8 +47,11 @@ class Learner:
         Raises:
             LearnerError: CUDA is asked for and not there.
         """
+        torch.set_num_threads(config.learner.num_threads)
         self.config = config
         self.version = 0
+        self.update_s = 0.0
+        """Duration of the last update, seconds."""
         self._layouts = seen = layouts(config.world)
         self._device = torch_device(config.learner.device)
         with torch.random.fork_rng(devices=[]):
@@ -94,6 +98,7 @@ class Learner:
         Raises:
             LearnerError: there are none.
         """
+        start = time.perf_counter()
         rollouts = [self._pending[key] for key in sorted(self._pending)]
         if not rollouts:
             raise LearnerError("learner update with 0 rollouts: ingest at least one first")
@@ -107,6 +112,7 @@ class Learner:
         self.version += 1
         self._average_bob()
         metrics["version"] = float(self.version)
+        self.update_s = time.perf_counter() - start
         return {f"learner/{name}": value for name, value in metrics.items() if math.isfinite(value)}
 
     def take_over(self, networks_by_name: Mapping[str, Mapping[str, Array]], seen: Layouts) -> list[str]:

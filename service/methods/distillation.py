@@ -18,7 +18,7 @@ from service.envs.observations import layouts
 from service.generator.bins import CELL_SIZE_M, GoalCells
 from service.learner import transfer
 from service.learner.distillation import Distiller
-from service.methods.method import Iteration, Method, State
+from service.methods.method import Iteration, Method, State, goal_grid
 from service.policies import networks
 from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
 from service.policies.parameters import Parameters
@@ -110,7 +110,8 @@ class Distillation(Method):
 
     def grid(self) -> GoalGrid:
         """The cells of random goals, and how often Bob solved those there."""
-        return self.grid_of(self._cells, self._tries, self._solved / np.maximum(1, self._tries))
+        tries, rates = self._tries, self._solved / np.maximum(1, self._tries)
+        return goal_grid(self._cells, np.flatnonzero(tries), tries, rates, self.iteration, self.num_env_steps)
 
     def close(self) -> None:
         """Stop the worlds' threads; a second call does nothing."""

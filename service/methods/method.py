@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import os
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
+
+import numpy as np
 
 from service.actors.rollout import Diverged
 from service.base.errors import TandemError
 from service.base.types import IntArray, Metrics, StateArray
 from service.generator.bins import GoalCells
-from service.methods.timing import Timing
 from service.policies.parameters import Parameters
-from service.store.models import ActorStatus, GoalGrid
+from service.store.models import ActorStatus, GoalCell, GoalGrid
 
 State = Mapping[str, Any]
 """By the name of a component its arrays, which have names of their own, or plain values as JSON has them."""
@@ -56,6 +60,32 @@ class Health:
     num_rollouts_refused: int = 0
     warnings: tuple[str, ...] = ()
     last_error: str | None = None
+
+
+class Timing:
+    """Wall-clock time of a run by named section; ``with timing("learn"): ...`` adds to it."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+        """Seconds spent in each named section, in order of first use."""
+        self._start = time.perf_counter()
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Count the time of a ``with`` block under ``name``."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] += time.perf_counter() - start
+
+    def tree(self) -> str:
+        """A line per section with its seconds and its share of the time since this object was made."""
+        total = time.perf_counter() - self._start
+        lines = [f"total {total:9.1f} s"]
+        lines += [f"  {name:<18}{spent:9.1f} s {100 * spent / total:5.1f} %" for name, spent in self.seconds.items()]
+        other = total - sum(self.seconds.values())
+        return "\n".join([*lines, f"  {'other':<18}{other:9.1f} s {100 * other / total:5.1f} %"])
 
 
 class Method(ABC):
@@ -149,8 +179,42 @@ class Method(ABC):
         self.num_env_steps += num_env_steps
         return {"iteration": self.iteration, "env_steps": self.num_env_steps}
 
-    def grid_of(self, cells: GoalCells, num_tries: IntArray, success_rate: StateArray) -> GoalGrid:
-        """The grid of (cells,) tries and success rates; untried cells are left out."""
-        learnability = success_rate * (1.0 - success_rate)
-        counted = {"iteration": self.iteration, "num_env_steps": self.num_env_steps}
-        return cells.grid(num_tries > 0, num_tries, success_rate, learnability, **counted)
+
+def goal_grid(
+    cells: GoalCells,
+    shown: IntArray,
+    num_tries: IntArray,
+    success_rate: StateArray,
+    iteration: int,
+    num_env_steps: int,
+) -> GoalGrid:
+    """The grid of what is known of goals after an iteration.
+
+    Args:
+        cells: of the workspace.
+        shown: (M,) indices of those that the grid has.
+        num_tries: (cells,) tries.
+        success_rate: (cells,) of these.
+        iteration: finished iterations.
+        num_env_steps: their env steps.
+    """
+    centers = cells.centers().reshape(-1, 3)
+    lower, upper = cells.bounds_m
+    return GoalGrid(
+        iteration=iteration,
+        num_env_steps=num_env_steps,
+        cell_size_m=cells.cell_size_m,
+        shape=cells.shape,
+        num_cells=len(cells),
+        lower_m=lower,
+        upper_m=upper,
+        cells=tuple(
+            GoalCell(
+                center_m=tuple(np.round(centers[cell], 4).tolist()),
+                num_tries=int(num_tries[cell]),
+                success_rate=round(float(success_rate[cell]), 4),
+                learnability=round(float(success_rate[cell] * (1.0 - success_rate[cell])), 4),
+            )
+            for cell in shown
+        ),
+    )

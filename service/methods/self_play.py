@@ -12,7 +12,6 @@ import logging
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,14 +24,7 @@ from service.config.self_play import SelfPlayConfig
 from service.envs.observations import layouts
 from service.generator.opponents import Opponents
 from service.methods.method import Health, Iteration, Method, State
-from service.methods.workers import (
-    GeneratorResult,
-    GeneratorWorker,
-    LearnerWorker,
-    RolloutWorker,
-    RoundSummary,
-    UpdateResult,
-)
+from service.methods.workers import GeneratorWorker, RolloutWorker, RoundSummary
 from service.policies.parameters import Parameters
 from service.registry.loading import Trained
 from service.registry.publishing import measure_bob
@@ -41,20 +33,6 @@ from service.store.models import GoalGrid
 _logger = logging.getLogger(__name__)
 OLDER_OPPONENTS = -1
 """Version of past players that a checkpoint has beside the task generator's, which have joined meanwhile."""
-
-
-@dataclass(frozen=True, slots=True)
-class IterationResult:
-    """Results of all workers for one iteration."""
-
-    rounds: Sequence[RoundSummary]
-    recorded: GeneratorResult
-    updated: UpdateResult | None
-    """None where there was nothing to learn from yet."""
-    num_actors_alive: int
-    elapsed_s: float
-    hand_over_s: float = 0.0
-    """Mean time a round's result was on its way or in line, seconds."""
 
 
 class SelfPlay(Method):
@@ -84,25 +62,39 @@ class SelfPlay(Method):
         """Success of the newest Bob on every kind of goals."""
         return measure_bob(self.config, self.parameters())
 
-    def _finish(self, result: IterationResult) -> Iteration:
-        """Count an iteration, and make its metrics."""
-        counted = self.count(sum(each.num_env_steps for each in result.rounds))
-        self._converged = result.recorded.should_stop
-        learned: Metrics = {}
-        if result.updated is not None:
-            learned = result.updated.metrics | {"time/learn_s": result.updated.update_s}
+    def _finish(
+        self,
+        rounds: Sequence[RoundSummary],
+        recorded: Iteration,
+        learned: Metrics,
+        *,
+        elapsed_s: float,
+        num_alive: int = 1,
+        hand_over_s: float = 0.0,
+    ) -> Iteration:
+        """Count an iteration, and put together what it leaves behind.
+
+        Args:
+            rounds: that were played.
+            recorded: the task generator's part.
+            learned: the learner's metrics; none where there was nothing to learn from yet.
+            elapsed_s: duration of the iteration.
+            num_alive: actors that have started.
+            hand_over_s: mean time that a round's result was on its way or in line.
+        """
+        counted = self.count(sum(each.num_env_steps for each in rounds))
         metrics = {
             **counted,
-            **_round_metrics(result.rounds),
-            **result.recorded.metrics,
+            **_round_metrics(rounds),
+            **recorded.metrics,
             **learned,
-            "actor/num_rollouts": float(len(result.rounds)),
-            "actor/num_alive": float(result.num_actors_alive),
-            "time/hand_over_s": result.hand_over_s,
-            "time/learner_idle_fraction": max(0.0, 1.0 - learned.get("time/learn_s", 0.0) / result.elapsed_s),
+            "actor/num_rollouts": float(len(rounds)),
+            "actor/num_alive": float(num_alive),
+            "time/hand_over_s": hand_over_s,
+            "time/learner_idle_fraction": max(0.0, 1.0 - learned.get("time/learn_s", 0.0) / elapsed_s),
         }
-        diverged = {"-".join(map(str, each.id)): each.diverged for each in result.rounds if each.diverged}
-        return Iteration(metrics, result.recorded.goals, diverged)
+        diverged = {"-".join(map(str, each.id)): each.diverged for each in rounds if each.diverged}
+        return Iteration(metrics, recorded.goals, diverged)
 
 
 class LocalSelfPlay(SelfPlay):
@@ -114,13 +106,15 @@ class LocalSelfPlay(SelfPlay):
     """
 
     def __init__(self, config: SelfPlayConfig, start_from: Trained | None = None) -> None:
+        from service.learner.learner import Learner  # here: a cluster's driver needs no torch
+
         super().__init__(config)
         self._incarnation = 0
         self._pending: Rollout | None = None
-        self._learner = LearnerWorker(config)
+        self.learner = Learner(config)
         self._actor = RolloutWorker(config, num_threads=config.run.num_threads)
         self._generator = GeneratorWorker(config)
-        self.learner, self.game, self.generator = self._learner.learner, self._actor.game, self._generator.generator
+        self.game, self.generator = self._actor.game, self._generator.generator
         self._snapshot, self._opponents = self.generator.snapshot(), self._generator.opponents()
         self._played = self.learner.weights()
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
@@ -134,16 +128,21 @@ class LocalSelfPlay(SelfPlay):
             weights, snapshot, opponents = self.learner.weights(), self._snapshot, self._opponents
             # For the next round, and as old as its weights will be.
             self._snapshot, self._opponents = self.generator.snapshot(), self._generator.opponents()
-        learning = self._executor.submit(self._learner.update, [self._pending]) if self._pending is not None else None
+        learning = None
+        if self._pending is not None:
+            self.learner.ingest(self._pending)
+            learning = self._executor.submit(self.learner.update)
         with self.timing("play"):
             rollout, goals, summary = self._actor.play(weights, snapshot, opponents)
         with self.timing("generator"):
             recorded = self._generator.record(self.iteration, weights, [goals])
+            self._converged = self.generator.should_stop()
+        learned: Metrics = {}
         with self.timing("wait for learner"):
-            updated = learning.result() if learning is not None else None
+            if learning is not None:
+                learned = learning.result() | {"time/learn_s": self.learner.update_s}
         self._pending, self._played = rollout, weights
-        elapsed_s = time.perf_counter() - begun
-        return self._finish(IterationResult([summary], recorded, updated, 1, elapsed_s))
+        return self._finish([summary], recorded, learned, elapsed_s=time.perf_counter() - begun)
 
     def evaluate(self) -> Metrics:
         """Success of the Bob who played the last round on the run's goals, without noise."""

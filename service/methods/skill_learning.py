@@ -115,7 +115,7 @@ class IntrinsicBatches:
         for _ in range(self._config.gradient_steps):
             rows = replay.read(replay.draw(self._config.batch_size, rng, newest=newest))
             steps = _tensors(self._see(rows), rows["skill"], jumps=False)
-            self.losses.append(self.reward.learn(*steps)["representation_loss"])
+            self.losses.append(self.reward.learn(*steps))
         rows = replay.read(replay.draw(size, rng))
         seen = self._see(rows)
         paid: FloatArray = self.reward.rewards(*_tensors(seen, rows["skill"], jumps=self.reward.pays_jumps)).numpy()

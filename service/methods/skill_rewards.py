@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrizations import spectral_norm
 
-from service.base.types import Array, Arrays, FloatArray, Metrics
+from service.base.types import Array, Arrays, FloatArray
 from service.config.skills import SkillMethod, SkillsConfig
 from service.learner.sac import ADAM_EPSILON, copied, put_back
 from service.learner.sac_networks import make_layers
@@ -47,8 +47,8 @@ class IntrinsicReward(ABC):
         self._random = torch.Generator().manual_seed(seed)
         self._optimizer = Adam(self._learned(), config.learning_rate, epsilon=ADAM_EPSILON)
 
-    def learn(self, before: Tensor, after: Tensor, skill: Tensor) -> Metrics:
-        """Make one gradient step."""
+    def learn(self, before: Tensor, after: Tensor, skill: Tensor) -> float:
+        """Make one gradient step; returns the loss before it."""
         self.network.train()  # where spectral norms are estimated, this goes on with that
         loss = self._loss(before, after, skill)
         self.network.eval()
@@ -56,7 +56,7 @@ class IntrinsicReward(ABC):
         for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
             parameter.grad = gradient
         self._optimizer.step()
-        return {"representation_loss": loss.item()}
+        return loss.item()
 
     @torch.no_grad()
     def rewards(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
@@ -79,11 +79,11 @@ class IntrinsicReward(ABC):
         """Continue, bit for bit, where ``state`` was taken by a reward of the same settings."""
         put_back(state, self._tensors(), self._random)
 
-    @abstractmethod
-    def _make_network(self) -> nn.Module: ...
+    def _make_network(self) -> nn.Module:
+        return make_layers(self.state_size, *self.config.hidden_sizes, self.config.size)
 
-    @abstractmethod
-    def _loss(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor: ...
+    def _loss(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
+        return -self._rewards(before, after, skill).mean()
 
     @abstractmethod
     def _rewards(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor: ...
@@ -103,14 +103,11 @@ class LSD(IntrinsicReward):
     """
 
     def _make_network(self) -> nn.Module:
-        layers = make_layers(self.state_size, *self.config.hidden_sizes, self.config.size)
-        for layer in layers:
+        network = super()._make_network()
+        for layer in network.children():
             if isinstance(layer, nn.Linear):
                 spectral_norm(layer)
-        return layers
-
-    def _loss(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
-        return -self._rewards(before, after, skill).mean()
+        return network
 
     def _rewards(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
         return _along(self.network(after) - self.network(before), skill)
@@ -125,9 +122,6 @@ class METRA(IntrinsicReward):
     def __init__(self, config: SkillsConfig, state_size: int, seed: int) -> None:
         self._log_dual = torch.tensor(math.log(config.dual_initial), requires_grad=True)
         super().__init__(config, state_size, seed)
-
-    def _make_network(self) -> nn.Module:
-        return make_layers(self.state_size, *self.config.hidden_sizes, self.config.size)
 
     def _loss(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
         step: Tensor = self.network(after) - self.network(before)
@@ -149,12 +143,6 @@ class METRA(IntrinsicReward):
 class DIAYN(IntrinsicReward):
     """``log q(z | s') - log p(z)`` with q = N(mu(s'), I) and p = N(0, I) (Eysenbach et al. 2019, continuous z)."""
 
-    def _make_network(self) -> nn.Module:
-        return make_layers(self.state_size, *self.config.hidden_sizes, self.config.size)
-
-    def _loss(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
-        return -self._rewards(before, after, skill).mean()
-
     def _rewards(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
         mean: Tensor = self.network(after)
         return 0.5 * (skill.square() - (skill - mean).square()).sum(dim=1)
@@ -174,7 +162,7 @@ class DADS(IntrinsicReward):
         self._moments = {name: torch.zeros(state_size) for name in ("before_mean", "change_mean")}
         self._moments |= {name: torch.ones(state_size) for name in ("before_square", "change_square")}
 
-    def learn(self, before: Tensor, after: Tensor, skill: Tensor) -> Metrics:
+    def learn(self, before: Tensor, after: Tensor, skill: Tensor) -> float:
         """Move the normalisation towards this batch's moments, then make one gradient step."""
         for name, values in {"before": before, "change": after - before}.items():
             self._moments[f"{name}_mean"].lerp_(values.mean(0), 1.0 - _MOMENT_DECAY)

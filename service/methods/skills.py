@@ -16,7 +16,7 @@ from service.base.tensors import join_parts, split_parts
 from service.base.types import Metrics
 from service.config.skills import SkillDiscoveryConfig
 from service.generator.bins import CELL_SIZE_M, GoalCells, in_air
-from service.methods.method import Iteration, Method, State
+from service.methods.method import Iteration, Method, State, goal_grid
 from service.methods.skill_learning import IntrinsicBatches, SkillWorlds, make_skill_loop
 from service.policies.frozen_skills import FrozenSkills, export_skills
 from service.policies.parameters import Parameters
@@ -77,7 +77,8 @@ class SkillDiscovery(Method):
 
     def grid(self) -> GoalGrid:
         """The cells into which episodes brought the object; no goals are tried, so success says nothing."""
-        return self.grid_of(self._cells, self._visits, np.full(len(self._cells), 0.5))
+        visits, rates = self._visits, np.full(len(self._cells), 0.5)
+        return goal_grid(self._cells, np.flatnonzero(visits), visits, rates, self.iteration, self.num_env_steps)
 
     def close(self) -> None:
         """Stop the worlds' threads; a second call does nothing."""

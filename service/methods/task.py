@@ -5,6 +5,7 @@ An iteration is an episode of every world.
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -13,17 +14,27 @@ import torch
 from service.actors.evaluation import DeterministicPolicy, Evaluation
 from service.base.errors import ConfigError, TandemError
 from service.base.types import Metrics
+from service.config.distillation import DistillingConfig
+from service.config.self_play import MCPConfig, SelfPlayConfig
 from service.config.task import TaskConfig
 from service.config.world import WorldConfig
 from service.envs.gym.vector import TabletopVectorEnv
+from service.envs.observations import POSITIONS
 from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
+from service.learner.off_policy import OffPolicyLoop
+from service.learner.replay import ReplayBuffer
+from service.learner.sac import Batch, SACLearner
+from service.learner.sac_networks import GaussianActor, MCPActor
 from service.methods.method import Iteration, Method, State
 from service.methods.task_evaluation import CURVE_SEED, FINAL_SEED, evaluate_on, numbers_of
-from service.methods.task_learner import make_loop, set_progress, spread_seed
-from service.methods.task_methods import find_method
-from service.methods.task_worlds import TaskWorlds
+from service.methods.task_methods import TaskMethod, find_method
+from service.methods.task_worlds import TaskWorlds, columns
 from service.policies.parameters import Parameters
+from service.registry.learned import learner_inputs, num_inputs
 from service.registry.loading import Trained, load
+
+_RELABELLED_UNTIL = 0.5
+"""Progress from which on the share of relabelled goals is its last one (docs/results/log.md, T17)."""
 
 
 class TaskLearning(Method):
@@ -55,7 +66,8 @@ class TaskLearning(Method):
     def step(self) -> Iteration:
         """Play an episode in every world, with its updates."""
         before, total = self.num_env_steps, self.config.run.total_env_steps
-        set_progress(self.loop, self._how, before / total)
+        assert isinstance(self.loop.make_batch, Hindsight)
+        self.loop.make_batch.set_progress(before / total)
         with self.timing("play and learn"):
             learned = self.loop.play(min(EPISODE_STEPS * self._worlds.num_worlds, total - before))
         metrics = self.count(self.loop.num_env_steps - before) | self._episodes()
@@ -121,6 +133,76 @@ class TaskLearning(Method):
             num_threads=config.run.num_threads,
         )
         return self._how.enter(env, spread_seed(config.seed, 3), self._acts_with, config.skill_steps)
+
+
+class Hindsight:
+    """Makes batches in which a share of the goals are places where the object came to later in the same episode.
+
+    Args:
+        worlds: whose rewards are paid.
+        ratio: see ``TaskMethod.her_ratio``.
+    """
+
+    def __init__(self, worlds: TaskWorlds, ratio: tuple[float, float] | None) -> None:
+        self._worlds, (self._first, self._last) = worlds, ratio or (0.0, 0.0)
+        self.share = self._first
+        """Of the transitions, on average (HER, ``future``)."""
+
+    def set_progress(self, progress: float) -> None:
+        """Set the share for a progress from 0, when learning begins, to 1, when it ends."""
+        self.share = self._first + (self._last - self._first) * min(1.0, progress / _RELABELLED_UNTIL)
+
+    def __call__(self, replay: ReplayBuffer, size: int, rng: np.random.Generator) -> Batch:
+        """Draw ``size`` transitions and relabel some of them."""
+        places = replay.draw(size, rng)
+        rows = replay.read(places)
+        if self.share:
+            other = rng.random(size) < self.share
+            achieved = replay.column("following", replay.draw_later(places, rng))[:, POSITIONS["object"]]
+            rows["goal"][other] = achieved[other]
+            rows["reward"][other, 0] = self._worlds.rewards(rows["following"][other], achieved[other])
+        return Batch(
+            learner_inputs(rows["previous"], rows["positions"], rows["goal"], self._worlds.seen),
+            rows["action"],
+            rows["reward"][:, 0],
+            learner_inputs(rows["before"], rows["following"], rows["goal"], self._worlds.seen),
+        )
+
+
+def make_loop(config: TaskConfig, method: TaskMethod, trained: Trained, worlds: TaskWorlds) -> OffPolicyLoop:
+    """Make a new learner in worlds that have begun; ``loop.make_batch`` is its ``Hindsight``.
+
+    Where an action lasts for H env steps, updates an env step and the horizon in env steps stay: H times the updates
+    after each action, and a discount of ``gamma ** H``.
+    """
+    size, hold = worlds.num_actions, worlds.steps_per_action
+    longer = {"gradient_steps": hold * config.sac.gradient_steps, "gamma": config.sac.gamma**hold}
+    sac = config.sac.model_copy(update=longer)
+    num_without_goal, num_seen = num_inputs(worlds.seen)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(spread_seed(config.seed, 0))
+        actor = (
+            MCPActor(num_without_goal, num_seen, size, _sizes_of(trained))
+            if method.mcp_actor
+            else GaussianActor(num_seen, size, sac.hidden_sizes)
+        )
+    learner = SACLearner(actor, num_seen, size, sac, spread_seed(config.seed, 1))
+    num_steps = -(-config.run.total_env_steps // (sac.num_worlds * hold))  # everything is kept
+    replay = ReplayBuffer(num_steps, sac.num_worlds, {**columns(worlds.seen), "action": size})
+    return OffPolicyLoop(worlds, replay, learner, Hindsight(worlds, method.her_ratio), spread_seed(config.seed, 2))
+
+
+def _sizes_of(trained: Trained) -> MCPConfig:
+    """Sizes of primitives and gate that are learned from nothing: those of the primitives that were named."""
+    if not isinstance(trained.config, SelfPlayConfig | DistillingConfig):
+        raise TandemError(f"{trained.label} has no primitives, whose sizes scratch-mcp takes: name some")
+    return trained.config.policy.bob
+
+
+@functools.cache
+def spread_seed(seed: int, purpose: int) -> int:
+    """A seed far from those of other trials: world i gets it plus i, so neighbours would share nearly all episodes."""
+    return int(np.random.SeedSequence((seed, purpose)).generate_state(1)[0]) >> 1
 
 
 def begin(config: TaskConfig, registry: Path | str, start_from: Trained | None) -> TaskConfig:

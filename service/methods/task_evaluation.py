@@ -1,12 +1,20 @@
-"""Episodes of a task, played by any policy."""
+"""Episodes of a task, played by any policy, and success over the seeds of a method, with an interval."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from service.actors.evaluation import DeterministicPolicy, Evaluation, evaluate, wilson_interval
 from service.base.types import Metrics
 from service.config import WorldConfig
 from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
 
+_STUDENT = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
+"""97.5th percentiles of Student's t for 1 to 9 degrees of freedom; 1.96 is near enough for more."""
 CURVE_SEED, FINAL_SEED = 1_000_000, 2_000_000
 """Added to a run's seed: goals of evaluations are none that were learned on, and the same for every method."""
 
@@ -45,3 +53,43 @@ def numbers_of(found: Evaluation) -> Metrics:
     low, high = wilson_interval(round(found.success_ever * found.num_episodes), found.num_episodes)
     measured = {**found.as_dict(), "success_ever_low": low, "success_ever_high": high}
     return {name: value for name, value in measured.items() if not isinstance(value, str)}
+
+
+class Rate(NamedTuple):
+    """A share of episodes, and both ends of its 95 % interval."""
+
+    mean: float
+    low: float
+    high: float
+    num_seeds: int
+
+    def __str__(self) -> str:
+        """Such as ``97.0 % [96, 98] (3)``; a star marks the interval of a single seed."""
+        star = "*" * (self.num_seeds == 1)
+        return f"{100 * self.mean:.1f} % [{100 * self.low:.0f}, {100 * self.high:.0f}]{star} ({self.num_seeds})"
+
+
+def rate_of(results: Sequence[Mapping[str, Any]], key: str = "success_last") -> Rate:
+    """The mean over one or more seeds.
+
+    The interval of several is for the mean over seeds (Student's t). That of one is Wilson's over its episodes: it
+    says how far the share may be off because episodes were few, not how far another seed would differ.
+
+    Args:
+        results: of one method on one task, a seed each, as ``result.json`` has them.
+        key: of ``evaluation``.
+    """
+    evaluations = [result["evaluation"] for result in results]
+    rates = [float(each[key]) for each in evaluations]
+    if len(rates) == 1:
+        num = evaluations[0]["num_episodes"]
+        return Rate(rates[0], *wilson_interval(round(rates[0] * num), num), 1)
+    return Rate(float(np.mean(rates)), *seed_interval(rates), len(rates))
+
+
+def seed_interval(rates: Sequence[float]) -> tuple[float, float]:
+    """Both ends of the 95 % interval for the mean of two or more seeds' rates, by Student's t, inside [0, 1]."""
+    degrees = len(rates) - 1
+    quantile = _STUDENT[degrees - 1] if degrees <= len(_STUDENT) else 1.96
+    half = quantile * float(np.std(rates, ddof=1)) / math.sqrt(len(rates))
+    return max(0.0, float(np.mean(rates)) - half), min(1.0, float(np.mean(rates)) + half)

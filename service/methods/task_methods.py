@@ -7,9 +7,8 @@ played by ``tandem evaluate --task``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import gymnasium
@@ -18,32 +17,12 @@ from service.base.errors import TandemError, did_you_mean
 from service.config.skills import SkillMethod
 from service.envs.observations import layouts
 from service.methods.compose import ComposePrimitivesVector, check_primitives, check_robot
-from service.methods.skill_worlds import SkillTaskWorlds
-from service.methods.task_worlds import TaskWorlds
+from service.methods.task_worlds import SkillTaskWorlds, TaskWorlds
 from service.policies.parameters import Parameters
 from service.registry.learned import RESIDUAL, Frozen, LearnedPolicy
 from service.registry.loading import Kind, Trained
 
-
-def _enter(env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, trained: Trained, hold_steps: int) -> TaskWorlds:
-    return TaskWorlds(env, seed, layouts(trained.config.world))
-
-
-def _enter_composing(
-    env: gymnasium.vector.VectorEnv[Any, Any, Any],
-    seed: int,
-    trained: Trained,
-    hold_steps: int,
-    *,
-    residual: float = 0.0,
-) -> TaskWorlds:
-    return _enter(ComposePrimitivesVector(env, trained, residual=residual), seed, trained, hold_steps)
-
-
-def _enter_with_skills(
-    env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, trained: Trained, hold_steps: int
-) -> TaskWorlds:
-    return SkillTaskWorlds(env, seed, trained.skills, hold_steps)
+VectorEnv = gymnasium.vector.VectorEnv[Any, Any, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +35,6 @@ class TaskMethod:
     """A few words for ``tandem methods``."""
     takes: Kind | None = None
     """What its result depends on; None: nothing, what is loaded only says in which world it plays."""
-    enter: Callable[[gymnasium.vector.VectorEnv[Any, Any, Any], int, Trained, int], TaskWorlds] = _enter
-    """Makes the worlds its learner acts in, of the task's, a seed, what it takes, and the env steps a skill is held."""
     mcp_actor: bool = False
     """Whether the actor is a Multiplicative Compositional Policy, learned end to end; else SAC's own network."""
     her_ratio: tuple[float, float] | None = None
@@ -74,6 +51,21 @@ class TaskMethod:
     def composes(self) -> bool:
         """Whether its learner sets the weights of primitives."""
         return self.takes == "primitives" and self.learns
+
+    def enter(self, env: VectorEnv, seed: int, trained: Trained, hold_steps: int) -> TaskWorlds:
+        """Make the worlds its learner acts in.
+
+        Args:
+            env: the task's.
+            seed: of episodes.
+            trained: what it takes.
+            hold_steps: env steps that a skill is held.
+        """
+        if self.skills is not None:
+            return SkillTaskWorlds(env, seed, trained.skills, hold_steps)
+        if self.composes:
+            env = ComposePrimitivesVector(env, trained, residual=self.residual)
+        return TaskWorlds(env, seed, layouts(trained.config.world))
 
     def frozen(self, trained: Trained) -> Frozen:
         """What its policy acts with; None: it acts by itself."""
@@ -105,22 +97,9 @@ _HER_SHARE = 0.8
 """1 - 1 / (k + 1) for the usual k = 4 (Andrychowicz et al. 2017)."""
 
 
-def _composing_method(
-    title: str, description: str, *, her_ratio: tuple[float, float] | None = None, residual: float = 0.0
-) -> TaskMethod:
-    return TaskMethod(
-        title,
-        description,
-        "primitives",
-        partial(_enter_composing, residual=residual),
-        her_ratio=her_ratio,
-        residual=residual,
-    )
-
-
 def _skill_method(name: SkillMethod) -> TaskMethod:
     title = f"{name.upper()} skills"
-    return TaskMethod(title, "SAC sets the skill vector", "skills", _enter_with_skills, skills=name)
+    return TaskMethod(title, "SAC sets the skill vector", "skills", skills=name)
 
 
 def _zero_shot_method(name: SkillMethod) -> TaskMethod:
@@ -128,12 +107,16 @@ def _zero_shot_method(name: SkillMethod) -> TaskMethod:
 
 
 METHODS: Mapping[str, TaskMethod] = {
-    "ours": _composing_method("ours", "SAC sets the weights of the frozen primitives"),
-    "ours-her": _composing_method(
-        "ours + HER", "the same, with relabelled goals, fewer and fewer", her_ratio=(_HER_SHARE, 0.0)
+    "ours": TaskMethod("ours", "SAC sets the weights of the frozen primitives", "primitives"),
+    "ours-her": TaskMethod(
+        "ours + HER", "the same, with relabelled goals, fewer and fewer", "primitives", her_ratio=(_HER_SHARE, 0.0)
     ),
-    "ours-residual-her": _composing_method(
-        "ours + residual + HER", "and adds a small action of its own", her_ratio=(_HER_SHARE, 0.0), residual=RESIDUAL
+    "ours-residual-her": TaskMethod(
+        "ours + residual + HER",
+        "and adds a small action of its own",
+        "primitives",
+        her_ratio=(_HER_SHARE, 0.0),
+        residual=RESIDUAL,
     ),
     "asp-only": TaskMethod("ASP only", "Bob as he is", "primitives", learns=False),
     "scratch-monolithic-her": TaskMethod(

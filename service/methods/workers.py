@@ -1,24 +1,23 @@
-"""The three workers of a run: the rollout worker, the learner and the task generator.
+"""Two of the three workers of self-play: the rollout worker and the task generator. The third is the ``Learner``.
 
-Both runners use them: ``local`` calls them in its own process, ``ray_actors`` puts each into a process of a Ray
-cluster. Arrays that come through Ray's object store are read-only and are never written to.
+``LocalSelfPlay`` calls them in its own process, ``ray_actors`` puts each into a process of a Ray cluster. Arrays that
+come through Ray's object store are read-only and are never written to.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.actors.evaluation import EVALUATION_SEED, success_metrics
 from service.actors.rollout import Diverged, Rollout
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
-from service.base.types import Arrays, Metrics
+from service.base.types import Metrics
 from service.config.self_play import SelfPlayConfig
 from service.envs.sampling import GoalKind
 from service.envs.scene import build_layout
@@ -27,20 +26,19 @@ from service.generator.generator import NUM_STARTS, TaskGenerator
 from service.generator.opponents import Opponents
 from service.generator.records import GoalSummary, join_summaries, summarize
 from service.generator.snapshot import GeneratorSnapshot
+from service.methods.method import Iteration, goal_grid
 from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
 from service.store.models import GoalGrid
 
 if TYPE_CHECKING:
     from service.learner.weights import Weights
 
-RolloutId = tuple[int, int, int]
-
 
 @dataclass(frozen=True, slots=True)
 class RoundSummary:
     """A played round in a few numbers; its rollout travels on its own."""
 
-    id: RolloutId
+    id: tuple[int, int, int]
     num_env_steps: int
     num_worlds: int
     num_diverged: int
@@ -49,31 +47,6 @@ class RoundSummary:
     """Those of this round."""
     play_s: float
     metrics: Metrics
-
-
-@dataclass(frozen=True, slots=True)
-class GeneratorResult:
-    """The task generator's result for an iteration."""
-
-    metrics: Metrics
-    should_stop: bool
-    goals: NDArray[np.float64]
-    """(M, 7) some of them for the run directory: start x y z, goal x y z (metres), solved 0/1."""
-    new_opponents: bool
-    """This iteration's players joined the past ones."""
-
-
-@dataclass(frozen=True, slots=True)
-class UpdateResult:
-    """The learner's result for an iteration."""
-
-    version: int
-    metrics: Metrics
-    counted: tuple[RolloutId, ...]
-    """Ids of the rollouts learned from."""
-    refused: tuple[RolloutId, ...]
-    """Seen before, too old, or of a version this learner has not made."""
-    update_s: float
 
 
 class RolloutWorker:
@@ -166,74 +139,35 @@ class GeneratorWorker:
 
     Args:
         config: the run.
-        state: to continue from; None to start.
     """
 
-    def __init__(self, config: SelfPlayConfig, state: Mapping[str, NDArray[Any]] | None = None) -> None:
+    def __init__(self, config: SelfPlayConfig) -> None:
         layout = build_layout(config.world, blocked_fraction=config.game.blocked_gripper_fraction)
         self.generator = TaskGenerator(config, layout)
-        if state is not None:
-            self.generator.load_state(state)
 
     def opponents(self) -> Opponents:
         """Past players for the next rounds."""
         return self.generator.opponents
 
-    def record(self, iteration: int, weights: Weights, goals: Sequence[GoalSummary]) -> GeneratorResult:
+    def record(self, iteration: int, weights: Weights, goals: Sequence[GoalSummary]) -> Iteration:
         """Learn from what became of an iteration's goals.
 
         Args:
             iteration: finished ones before it.
             weights: of the players of this iteration, who may become past opponents.
             goals: of all its rounds.
+
+        Returns:
+            The task generator's metrics, and a sample of the goals.
         """
         joined = join_summaries(goals)
         metrics = self.generator.record(joined)
-        new_opponents = self.generator.opponents_due(iteration)
-        if new_opponents:
+        if self.generator.opponents_due(iteration):
             self.generator.add_opponents(iteration, weights.alice, weights.bob)
-        return GeneratorResult(metrics, self.generator.should_stop(), joined.shown, new_opponents)
+        return Iteration(metrics, joined.shown)
 
     def grid(self, iteration: int, num_env_steps: int) -> GoalGrid:
         """The cells in which a valid goal was ever proposed, as they are after ``iteration`` iterations."""
         grid = self.generator.grid
-        rates, learnability = (
-            np.array([round(float(value), 4) for value in values])
-            for values in (grid.counts.success_rate(), grid.counts.learnability())
-        )
-        counted = {"iteration": iteration, "num_env_steps": num_env_steps}
-        return grid.cells.grid(grid.seen, grid.counts.num_tries, rates, learnability, **counted)
-
-
-class LearnerWorker:
-    """The learner, behind one call for an update.
-
-    Consumes rollouts, produces weights and metrics; waits for nothing.
-
-    Args:
-        config: the run.
-        state: to continue from; None to start.
-    """
-
-    def __init__(self, config: SelfPlayConfig, state: Arrays | None = None) -> None:
-        import torch  # here, not where runs are only read
-
-        from service.learner.learner import Learner
-
-        torch.set_num_threads(config.learner.num_threads)
-        self.learner = Learner(config)
-        if state is not None:
-            self.learner.load_state(state)
-
-    def update(self, rollouts: Sequence[Rollout]) -> UpdateResult:
-        """Learn from rollouts; makes the next version.
-
-        Raises:
-            LearnerError: none of them could be learned from.
-        """
-        start = time.perf_counter()
-        taken = [rollout for rollout in rollouts if self.learner.ingest(rollout)]
-        metrics = self.learner.update()
-        counted = tuple(rollout.id for rollout in taken)
-        refused = tuple(rollout.id for rollout in rollouts if rollout.id not in counted)
-        return UpdateResult(self.learner.version, metrics, counted, refused, time.perf_counter() - start)
+        counts, seen = grid.counts, np.flatnonzero(grid.seen)
+        return goal_grid(grid.cells, seen, counts.num_tries, counts.success_rate(), iteration, num_env_steps)

@@ -131,7 +131,7 @@ def _rows(runs: Sequence[_Run]) -> list[dict[Column, list[_Run]]]:
 
 
 def _cell(runs: Sequence[_Run], all_runs: Sequence[_Run]) -> TaskCell:
-    from service.methods.task_rates import rate_of
+    from service.methods.task_evaluation import rate_of
 
     ended = sorted((run for run in runs if run.result is not None), key=lambda run: run.ended)
     by_seed = {run.trial.seed: run for run in ended}

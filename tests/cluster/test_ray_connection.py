@@ -1,11 +1,5 @@
-"""Connections to Ray: a slow machine, a wrong token, errors of workers; real runs are in test_cluster and test_job."""
+"""Connections to Ray: a slow machine, errors of workers; real runs are in test_cluster and test_job."""
 
-import os
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
-
-import grpc
 import pytest
 import ray
 from ray.exceptions import ActorDiedError, RayTaskError
@@ -13,7 +7,7 @@ from ray.exceptions import ActorDiedError, RayTaskError
 from service.base.errors import DivergedError
 from service.cluster.ray_connection import START_ATTEMPTS, connected, explaining_ray_errors
 from service.methods.method import WorkersError
-from tests.runs.runs import ROOT, assert_one_line
+from tests.runs.runs import assert_one_line
 
 SLOW = "The current node timed out during startup. This could happen because some of the raylet failed to startup"
 
@@ -30,7 +24,6 @@ def starts(monkeypatch):
 
     monkeypatch.setattr(ray, "init", init)
     monkeypatch.setattr(ray, "shutdown", lambda: None)
-    monkeypatch.setattr("service.cluster.ray_connection._check_token", lambda address: None)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     return tried, failing
 
@@ -57,105 +50,6 @@ def test_another_cluster_is_asked_once(starts):
     with pytest.raises(WorkersError), connected("auto"):
         pass
     assert tried == [("auto",)]
-
-
-LISTENING = """
-import psutil
-from service.cluster.ray_connection import connected
-with connected(None, num_cpus=1):
-    import ray
-
-    @ray.remote
-    class Worker:
-        def ping(self):
-            pass
-
-    worker = Worker.remote()
-    ray.get(worker.ping.remote())
-    me = psutil.Process()
-    for process in (me, *me.children(recursive=True)):
-        for each in process.net_connections(kind="tcp"):
-            if each.status == psutil.CONN_LISTEN:
-                print(each.laddr.ip)
-"""
-
-
-def test_a_ray_of_our_own_listens_on_loopback_only():
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
-    command = [sys.executable, "-c", LISTENING]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    addresses = done.stdout.split()
-    assert len(addresses) >= 8  # of its control store, node, agents, worker and this driver
-    assert set(addresses) <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
-
-
-# --- the token --------------------------------------------------------------------------------------------------------
-
-
-class Head(grpc.GenericRpcHandler):
-    """Answers like the head of a cluster that wants a token, or like something else that speaks gRPC."""
-
-    def __init__(self, token, error=grpc.StatusCode.UNAUTHENTICATED):
-        self._token, self._error = token, error
-
-    def service(self, details):
-        given = dict(details.invocation_metadata).get("authorization")
-
-        def answer(request, context):
-            assert details.method == "/ray.rpc.NodeInfoGcsService/GetClusterId"
-            if given != f"Bearer {self._token}":
-                context.abort(self._error, "InvalidAuthToken:\nmissing or incorrect")
-            return b""
-
-        return grpc.unary_unary_rpc_method_handler(answer)
-
-
-@pytest.fixture
-def serve(monkeypatch):
-    """Start a head; gives its address. This machine's own address is not asked for."""
-    monkeypatch.setattr("ray._private.services.canonicalize_bootstrap_address", lambda address: address)
-    servers = []
-
-    def start(head):
-        servers.append(grpc.server(ThreadPoolExecutor(max_workers=1), handlers=[head]))
-        port = servers[-1].add_insecure_port("127.0.0.1:0")
-        servers[-1].start()
-        return f"127.0.0.1:{port}"
-
-    yield start
-    for server in servers:
-        server.stop(grace=None)
-
-
-def test_a_wrong_token_is_named_before_ray_is_asked(serve, monkeypatch):
-    monkeypatch.setattr(ray, "init", lambda *arguments, **options: pytest.fail("Ray tries for 20 s"))
-    address = serve(Head("a" * 64))
-    with pytest.raises(WorkersError) as error, connected(address):
-        pass
-    assert_one_line(
-        error.value, address, "it refuses the token that was sent: set RAY_AUTH_TOKEN", "InvalidAuthToken: "
-    )
-    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
-    with pytest.raises(WorkersError) as error, connected(address):
-        pass
-    assert_one_line(error.value, "it wants a token, and none was sent: set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN")
-
-
-def test_the_right_token_goes_on_to_ray(serve, monkeypatch):
-    tried = []
-    monkeypatch.setattr(ray, "init", lambda *arguments, **options: tried.append(arguments))
-    monkeypatch.setattr(ray, "shutdown", lambda: None)
-    address = serve(Head(os.environ["RAY_AUTH_TOKEN"]))
-    with connected(address):
-        assert tried == [(address,)]
-
-
-def test_somebody_else_at_that_port(serve, monkeypatch):
-    monkeypatch.setattr(ray, "init", lambda *arguments, **options: pytest.fail("Ray tries for 20 s"))
-    with pytest.raises(WorkersError) as error, connected(serve(Head("", grpc.StatusCode.UNAVAILABLE))):
-        pass
-    assert_one_line(error.value, "no Ray cluster answers there")
 
 
 # --- workers ----------------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ import sys
 import time
 from contextlib import contextmanager
 
+import psutil
 import pytest
 
 from benchmarks.processes import descendants
@@ -61,17 +62,27 @@ def test_a_signal_while_it_starts(tmp_path, number, when):
     assert [role for pid, role in below.items() if is_alive(pid)] == []
 
 
+def assert_on_loopback(pid):
+    """A Ray of our own is for this machine alone."""
+    root = psutil.Process(pid)
+    connections = [each for part in (root, *root.children(recursive=True)) for each in part.net_connections("tcp")]
+    addresses = [each.laddr.ip for each in connections if each.status == psutil.CONN_LISTEN]
+    assert len(addresses) >= 8  # of its control store, node, agents, workers and the driver
+    assert set(addresses) <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
+
+
 def test_a_raylet_that_is_frozen_for_ever_ends_the_run(tmp_path):
     """No call of the driver needs to come back for that, and nobody is blamed for it, or replaced in vain."""
-    sooner = "from service.cluster import raylet; raylet.SILENT_S, raylet.LOST_S = 1.0, 10.0"
+    sooner = "from service.cluster import watch; watch.SILENT_S, watch.LOST_S = 1.0, 4.0"
     directory = RunDirectory(tmp_path / "run")
     with run_on_ray(tmp_path, sooner) as process:
         wait_until(process, lambda: directory.metrics_file.exists() and len(read_jsonl(directory.metrics_file)) >= 2)
         below = descendants(process.pid)
+        assert_on_loopback(process.pid)
         os.kill(next(pid for pid, role in below.items() if role == "raylet"), signal.SIGSTOP)
         assert process.wait(PATIENCE_S) == 1
     said = (tmp_path / "err").read_text().strip().splitlines()[-1]
-    assert_one_line(said, "the raylet, has not answered for 1", "--resume goes on from iteration 0")
+    assert_one_line(said, "the raylet, has not answered for ", "--resume goes on from iteration 0")
     status = read_status(directory.path)
     assert (status.state, status.last_error) == ("failed", said.replace("error", "WorkersError", 1))
     assert {actor.incarnation for actor in status.actors} == {0}

@@ -10,10 +10,9 @@ import service
 from service.base.errors import TandemError
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.observations import POSITIONS
-from service.methods.skill_worlds import SkillTaskWorlds
 from service.methods.task import TaskLearning
 from service.methods.task_methods import METHODS
-from service.methods.task_worlds import TaskWorlds
+from service.methods.task_worlds import SkillTaskWorlds, TaskWorlds
 from service.policies.frozen_skills import ZeroShotPolicy
 from service.registry.publishing import publish
 from service.registry.registry import Registry

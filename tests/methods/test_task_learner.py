@@ -2,9 +2,7 @@ import numpy as np
 import pytest
 
 from service.config.skills import SACConfig
-from service.methods.task import TaskLearning
-from service.methods.task_learner import Hindsight, set_progress
-from service.methods.task_methods import METHODS
+from service.methods.task import Hindsight, TaskLearning
 from tests.methods.trials import SMALL, small_trial
 
 
@@ -68,7 +66,7 @@ def test_relabelled_goals_are_where_the_object_came_to_later_in_the_episode(cham
     worlds = loop.worlds
     rewards = worlds.rewards
     worlds.rewards = lambda following, goal: seen.append((following, goal)) or rewards(following, goal)
-    batch = Hindsight(worlds, 1.0)(loop.replay, 400, np.random.default_rng(0))
+    batch = Hindsight(worlds, (1.0, 1.0))(loop.replay, 400, np.random.default_rng(0))
     ((following, goal),) = seen
     step, world, _ = (100 * following[:, 5:8]).round().astype(int).T
     goal_step, goal_world, _ = (100 * goal).round().astype(int).T
@@ -91,7 +89,7 @@ def test_without_hindsight_transitions_are_as_they_were(champion):
     loop = loop_of("ours", champion)
     loop.play(SMALL["learning_starts"])
     state = loop.replay.state()
-    batch = Hindsight(loop.worlds, 0.0)(loop.replay, 100, np.random.default_rng(0))
+    batch = Hindsight(loop.worlds, None)(loop.replay, 100, np.random.default_rng(0))
     goals = (state["goal"].reshape(-1, 3) - [0, 0, 0.15]) / 0.12
     acted = state["action"].reshape(len(goals), -1)
     kept = np.column_stack([goals, state["reward"].reshape(-1, 1), acted])
@@ -111,7 +109,7 @@ def test_the_share_of_relabelled_goals(champion, method, shares):
     loop.worlds.rewards = lambda following, goal: relabelled.append(len(goal)) or rewards(following, goal)
     assert loop.make_batch.share == shares[0]
     for progress, share in zip((0.0, 0.25, 0.5, 1.0), shares, strict=True):
-        set_progress(loop, METHODS[method], progress)
+        loop.make_batch.set_progress(progress)
         loop.make_batch(loop.replay, 10_000, np.random.default_rng(0))
         assert (relabelled.pop() if share else 0) == pytest.approx(10_000 * share, abs=200)
         assert not relabelled

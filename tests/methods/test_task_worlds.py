@@ -96,13 +96,6 @@ def test_restored_worlds_go_on_bit_for_bit(champion):
     second.close()
 
 
-def test_a_state_of_other_worlds_is_refused(ours):
-    other = make(num=2)
-    with pytest.raises(ValueError, match=r"expected shape \(3, "):
-        ours.load_state(*other.state())
-    other.close()
-
-
 def test_what_is_paid_for_another_goal(ours):
     following = np.zeros((3, 11), np.float32)
     following[:, 5:8] = [[0.0499, 0.0, 0.0], [0.0501, 0.0, 0.0], [0.0, 0.0, -0.0599]]

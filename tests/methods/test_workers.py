@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from service.generator.ring import join_rows
-from service.methods.workers import GeneratorWorker, LearnerWorker, RolloutWorker
+from service.learner.learner import Learner
+from service.methods.workers import GeneratorWorker, RolloutWorker
 from tests.actors.players import assert_same_rollout
 from tests.runs.runs import tiny_config
 
@@ -32,7 +33,7 @@ def make_actor(config):
 @pytest.fixture
 def learned(config, make_actor):
     """Weights, and a generator that has past players and goals to replay."""
-    generator, weights, actor = GeneratorWorker(config), LearnerWorker(config).learner.weights(), make_actor()
+    generator, weights, actor = GeneratorWorker(config), Learner(config).weights(), make_actor()
     for iteration in range(10):
         _, goals, _ = actor.play(weights, generator.generator.snapshot(), generator.opponents())
         generator.record(iteration, weights, [goals])
@@ -100,8 +101,11 @@ def test_past_players_are_built_once(learned, make_actor, config):
         built.append(actor._past)
     assert built[0] is built[1]
     interval = config.generator.opponent_interval
-    results = [generator.record(iteration, weights, [goals]) for iteration in range(interval + 1)]
-    assert [result.new_opponents for result in results] == [False] * interval + [True]
+    versions = []
+    for iteration in range(interval + 1):
+        generator.record(iteration, weights, [goals])
+        versions.append(generator.opponents().version)
+    assert versions == [opponents.version] * interval + [interval]
     actor.play(weights, snapshot, generator.opponents())
     assert actor._past is not built[0]
     assert len(actor._past) == len(generator.opponents().alice) == config.generator.opponent_pool_size

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from service.base.progress import PLAIN_INTERVAL_S, Display
-from service.methods.timing import Timing
+from service.methods.method import Timing
 from service.runs.progress import Progress
 from tests.clock import Clock
 

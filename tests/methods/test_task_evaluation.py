@@ -1,6 +1,6 @@
 import pytest
 
-from service.methods.task_rates import rate_of, seed_interval
+from service.methods.task_evaluation import rate_of, seed_interval
 
 
 def test_rates_by_hand():
