@@ -455,3 +455,8 @@ def _draw_box(axes: Any, workspace: WorkspaceConfig) -> None:
     axes.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", xlim=x, ylim=y, zlim=(0.0, high[2]))
     axes.set_box_aspect((np.ptp(x), np.ptp(y), high[2]), zoom=1.05)
     axes.view_init(elev=22, azim=-58)
+    axes.tick_params(colors="#555555", labelsize=8)
+    axes.locator_params(nbins=5)
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.pane.fill = False
+        axis._axinfo["grid"]["color"] = "#ececec"
