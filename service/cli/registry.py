@@ -149,8 +149,7 @@ def card(
 
 def _summary(registry: Registry, manifest: Manifest) -> dict[str, Any]:
     """A version's row in the list; two registries may both have a version 1, so it says where this one is."""
-    from service.registry.bundled import is_bundled
-    from service.registry.exported import ExportedVersion
+    from service.registry.bundled import ExportedVersion, is_bundled
 
     exported = isinstance(registry, ExportedVersion)
     return {

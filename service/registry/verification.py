@@ -16,9 +16,8 @@ from service.policies.inputs import NUM_MOTION_INPUTS
 from service.policies.numpy_actor import numpy_actor
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.policies.parameters import Shapes, bob_shapes, layer_shapes, misfits
-from service.registry.acting import acting_config
 from service.registry.loading import ORCHESTRATOR
-from service.registry.manifest import Manifest
+from service.registry.manifest import Manifest, acting_config
 
 _OBJECT_SIZE = POSITIONS["object"].stop - POSITIONS["object"].start
 """Of the object's position, which rewards of skill discovery see."""

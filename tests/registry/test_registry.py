@@ -15,7 +15,6 @@ import safetensors.numpy
 from service.base.errors import DamagedBlobError, FormatVersionError, RegistryError, StorageError, UnknownVersionError
 from service.config import Config
 from service.registry import names
-from service.registry.aliases import move_alias
 from service.registry.manifest import parse_manifest
 from service.registry.names import Version
 from service.registry.registry import Registry
