@@ -78,8 +78,8 @@ def verify(
     """Check every byte against its digest, and every parameter; exit code 1 when something is damaged."""
     from service.base.errors import RegistryError
     from service.registry.bundled import find_version
+    from service.registry.loading import network_problems
     from service.registry.registry import Registry
-    from service.registry.verification import network_problems
 
     if reference is not None:
         registry, version = find_version(reference, directory)

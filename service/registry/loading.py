@@ -20,6 +20,7 @@ from service.config.task import TaskConfig
 from service.envs.observations import layouts
 from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
 from service.policies.frozen_skills import FrozenSkills, ZeroShotPolicy
+from service.policies.numpy_actor import numpy_actor
 from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy, NumpyPolicy, numpy_bob
 from service.policies.parameters import Parameters, PolicyError
 from service.registry.bundled import BUNDLED, find_version, is_bundled, is_exported
@@ -277,14 +278,36 @@ def _load_version(reference: str, registry: Path | str, primitives: str | None) 
     config = acting_config(manifest.config, where=f"the manifest of {reference}")
     try:
         if isinstance(config, SkillDiscoveryConfig):
-            player = ZeroShotPolicy(FrozenSkills(parameters, config.skills.method))
-            return Trained(label, SKILLS, config, player, parameters, manifest, path)
+            return Trained(label, SKILLS, config, _skills(config, parameters), parameters, manifest, path)
         if kind == PRIMITIVES:
             bob, networks = NumpyMCPPolicy(parameters), {"bob/policy": parameters}
             return Trained(label, PRIMITIVES, config, bob, parameters, manifest, path, networks)
     except PolicyError as error:
         raise TandemError(f"{label} holds no {kind}: {error}") from None
     raise TandemError(f"{label} is of the kind {kind!r}, which this tandem cannot load; load it with a newer one")
+
+
+def network_problems(manifest: Manifest, arrays: Parameters) -> list[str]:
+    """Tell what keeps a policy from being made of a version's parameters, in one line; empty when it can be made.
+
+    A manifest without networks in its configuration describes none, and nothing is asked of it.
+    """
+    try:
+        if manifest.spaces.get("kind") == ORCHESTRATOR:
+            numpy_actor(dict(arrays))
+        elif manifest.config.keys() & {"policy", "skills"}:
+            config = acting_config(manifest.config, where="its configuration")
+            if isinstance(config, SkillDiscoveryConfig):
+                _skills(config, arrays)
+            else:
+                NumpyMCPPolicy(arrays)
+    except TandemError as error:
+        return [str(error)]
+    return []
+
+
+def _skills(config: SkillDiscoveryConfig, parameters: Parameters) -> ZeroShotPolicy:
+    return ZeroShotPolicy(FrozenSkills(parameters, config.skills.method))
 
 
 def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tuple[Path | str, str | None]) -> Trained:
@@ -300,8 +323,7 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
         raise TandemError(f"{label} is a run of the method {config.method}, which makes nothing that can be loaded")
     parameters = parts[config.part]
     if isinstance(config, SkillDiscoveryConfig):
-        skills = ZeroShotPolicy(FrozenSkills(parameters, config.skills.method))
-        return Trained(label, SKILLS, config, skills, parameters, path=path)
+        return Trained(label, SKILLS, config, _skills(config, parameters), parameters, path=path)
     if isinstance(config, TaskConfig):
         trained = None
         if config.primitives_digest is not None:

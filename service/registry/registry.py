@@ -14,7 +14,7 @@ A publish writes the blob, then the manifest, then the aliases, each atomically:
 from __future__ import annotations
 
 import fcntl
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -186,7 +186,7 @@ class Registry:
         return target
 
     def verify(self, reference: str | None = None, check: Check = lambda manifest, arrays: []) -> list[str]:
-        """Read a version, or everything, and check each byte; and that every number is finite.
+        """Read a version, or everything, and check each byte.
 
         Args:
             reference: of the version; None for everything.
@@ -275,7 +275,7 @@ class Registry:
             return [f"{version}: {error}"]
         if (manifest.name, manifest.version) != version:
             return [f"{version}: its manifest is that of {manifest.reference}; restore the file from a copy"]
-        return [f"{version}: {problem}" for problem in (*_not_finite(arrays), *check(manifest, arrays))]
+        return [f"{version}: {problem}" for problem in check(manifest, arrays)]
 
     def _alias_problems(self, name: str) -> list[str]:
         numbers = {version.number for version in self.versions(name)}
@@ -311,9 +311,3 @@ class Registry:
 
     def _alias_directory(self, name: str) -> Path:
         return self._directory(name) / "aliases"
-
-
-def _not_finite(arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
-    for name, array in arrays.items():
-        if array.dtype.kind in "fc" and (num := int((~np.isfinite(array)).sum())):
-            yield f"parameter {name!r} has {num} of {array.size} numbers that are not finite; use an earlier version"

@@ -188,9 +188,9 @@ def test_the_number_of_streams_is_limited(root, service, monkeypatch):
         assert (refused.status_code, refused.json()["type"]) == (503, "urn:tandem:too-many-streams")
         assert "tandem_http_streams 1.0" in client.get("/metrics").text
     deadline_s = time.monotonic() + 300
-    while server.app.streams.num_open and time.monotonic() < deadline_s:
+    while server.app.state.streams.num_open and time.monotonic() < deadline_s:
         time.sleep(0.02)
-    assert server.app.streams.num_open == 0
+    assert server.app.state.streams.num_open == 0
 
 
 def test_fifty_browsers_that_never_close_their_connection(root, service, caplog):
@@ -200,9 +200,9 @@ def test_fifty_browsers_that_never_close_their_connection(root, service, caplog)
     for browser in browsers:
         browser.sendall(request)  # and never reads the answer
     deadline_s = time.monotonic() + 300
-    while server.app.streams.num_open < 50 and time.monotonic() < deadline_s:
+    while server.app.state.streams.num_open < 50 and time.monotonic() < deadline_s:
         time.sleep(0.02)
-    assert server.app.streams.num_open == 50
+    assert server.app.state.streams.num_open == 50
     append(root, "cube", *(record(i) for i in range(4, 20)))
     answer = client.get("/v1/series", params={"runs": "cube", "names": "bob/success_rate"}).json()
     assert len(answer["runs"][0]["x"]) == 19
@@ -210,9 +210,9 @@ def test_fifty_browsers_that_never_close_their_connection(root, service, caplog)
         take(heard, "metrics")
     for browser in browsers:
         browser.close()
-    while server.app.streams.num_open and time.monotonic() < deadline_s:
+    while server.app.state.streams.num_open and time.monotonic() < deadline_s:
         time.sleep(0.02)
-    assert server.app.streams.num_open == 0
+    assert server.app.state.streams.num_open == 0
     assert caplog.records == []  # that they went is no error of the service
 
 
