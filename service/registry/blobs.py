@@ -7,6 +7,10 @@ from pathlib import Path
 
 from service.base.errors import DamagedBlobError
 from service.base.files import os_errors, write_atomic
+from service.base.regular_files import read_regular
+
+MAX_BYTES = 1024**3
+"""Of a blob; the largest primitives there are have about a megabyte."""
 
 
 class BlobStore:
@@ -44,7 +48,7 @@ class BlobStore:
         path = self.path(digest)
         with os_errors("read", path):
             try:
-                data = path.read_bytes()
+                data = read_regular(path, MAX_BYTES, follow=True)
             except FileNotFoundError:
                 raise DamagedBlobError(f"blob {path} is missing; {_MEND}") from None
         check_digest(path, data, digest)

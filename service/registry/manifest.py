@@ -17,11 +17,14 @@ from pydantic import Field, JsonValue, StrictInt, ValidationError
 from service.base.errors import DamagedBlobError, FormatVersionError, RegistryError
 from service.base.files import os_errors
 from service.base.parsing import ParseError, parse_json
+from service.base.regular_files import read_regular
 from service.config import Config, parse_config
 from service.config.frozen import FrozenModel
 from service.config.tree import group_of
 
 FORMAT_VERSION = 1
+MAX_BYTES = 4 * 1024 * 1024
+"""Of a manifest; usual are ten thousand."""
 ACTING = (
     "name",
     "world",
@@ -110,7 +113,7 @@ def read_manifest(path: Path) -> Manifest:
         StorageError: it cannot be read; or as for ``parse_manifest``.
     """
     with os_errors("read", path):
-        data = path.read_bytes()
+        data = read_regular(path, MAX_BYTES, follow=True)
     return parse_manifest(data, path)
 
 

@@ -25,11 +25,14 @@ from service.base import tensors
 from service.base.errors import RegistryError, StorageError, UnknownVersionError, did_you_mean
 from service.base.files import os_errors, write_atomic, write_exclusive
 from service.base.git import git_commit
+from service.base.regular_files import read_regular
 from service.registry import names
 from service.registry.blobs import BlobStore, sha256_of
 from service.registry.manifest import Manifest, make_manifest, read_manifest
 from service.registry.names import LATEST, Version
 
+MAX_ALIAS_BYTES = 100
+"""Of an alias' file, which holds a number."""
 READ_ONLY_FILE = "READ_ONLY"
 EXPORTED_MANIFEST, EXPORTED_PARAMETERS = "manifest.json", "primitives.safetensors"
 """Files of an exported version."""
@@ -247,7 +250,7 @@ class Registry:
         path = self._alias_directory(name) / names.check_alias(alias)
         with os_errors("read", path):
             try:
-                text = path.read_text("ascii", errors="replace").strip()
+                text = read_regular(path, MAX_ALIAS_BYTES, follow=True).decode("ascii", errors="replace").strip()
             except FileNotFoundError:
                 return None
         if not names.is_number(text):

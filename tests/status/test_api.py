@@ -9,8 +9,8 @@ import pytest
 from service.registry.bundled import BUNDLED
 from service.registry.manifest import parse_manifest
 from service.registry.registry import Registry
-from service.status.server import StatusServer
 from service.status.api_primitives import Shelf
+from service.status.server import StatusServer
 from service.store.disk_reader import DiskReader
 from service.store.models import GoalGrid, RunStatus
 from tests.status.conftest import serve

@@ -60,16 +60,6 @@ def test_after_an_iteration(root, after, iterations):
     assert answer.metrics == {"x": iterations}
 
 
-def test_before_the_first_record(root):
-    answer = ask(DiskReader(root), names=None)
-    assert (answer.last_iteration, answer.iteration, answer.metrics, answer.names) == (0, (), {}, ())
-
-
-def test_iteration_and_env_steps_are_columns_of_their_own(root):
-    append(root, "cube", record(1, x=0.5))
-    assert ask(DiskReader(root), names=["env_steps", "x", "x", "iteration"]).metrics == {"x": (0.5,)}
-
-
 def test_a_history_that_was_cut(root):
     reader = DiskReader(root)
     append(root, "cube", *(record(i, x=i) for i in (1, 2, 3, 4)))
