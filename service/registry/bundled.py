@@ -46,16 +46,14 @@ def find_version(reference: str, root: Path | str) -> tuple[Registry, Version]:
         name, target = split_reference(reference)
         if is_bundled(own) or target in own.aliases(name):
             raise
-        if not bundled.versions(name):
-            raise UnknownVersionError(
-                f"{error}; with tandem comes: {', '.join(bundled.names()) or 'nothing'}"
-                f"{did_you_mean(name, [*own.names(), *bundled.names()])}"
-            ) from None
-        missing = str(error) if own.versions(name) else f"the registry {own.root} has no {name} at all"
+        missing = str(error)
     try:
         return bundled, bundled.resolve(reference)
     except UnknownVersionError as error:
-        raise UnknownVersionError(f"{missing}; nor does one come with tandem: {error}") from None
+        if bundled.versions(name):
+            raise UnknownVersionError(f"{missing}; nor does one come with tandem: {error}") from None
+        hint = did_you_mean(name, [*own.names(), *bundled.names()])
+        raise UnknownVersionError(f"{missing}; with tandem comes: {', '.join(bundled.names())}{hint}") from None
 
 
 def is_bundled(registry: Registry) -> bool:

@@ -58,8 +58,10 @@ def fetch_primitives(
     base = _base_url(url)
     name, target = split_reference(reference)
     directory = hashlib.sha256(base.encode()).hexdigest()[:16]  # one for each service: two may both have a version 1
-    registry = Registry((cache_dir or _default_cache()) / directory)
-    if token is None and _is_configured(base):
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tandem" / "registries"
+    registry = Registry((cache_dir or caches) / directory)
+    configured = {os.environ.get(variable, "").rstrip("/") for variable in (URL_VARIABLE, REGISTRY_VARIABLE)}
+    if token is None and base in configured:  # the environment's token is for this service, not for any URL
         token = read_token()
     headers = {"Authorization": f"Bearer {token}"} if token else {}
     with httpx.Client(base_url=base, headers=headers, timeout=_TIMEOUT) as service:
@@ -96,11 +98,6 @@ def _get(service: httpx.Client, path: str) -> bytes:
     return response.content
 
 
-def _is_configured(base: str) -> bool:
-    """Whether the environment names this very service, so that the environment's token is for it."""
-    return base in {os.environ.get(variable, "").rstrip("/") for variable in (URL_VARIABLE, REGISTRY_VARIABLE)}
-
-
 def _refusal(base: str, response: httpx.Response) -> TandemError:
     """The error in an answer that is not a success."""
     kind = response.headers.get("content-type", "nothing")
@@ -130,7 +127,3 @@ def _base_url(url: str) -> str:
     if parsed.userinfo or not parsed.host or parsed.scheme not in ("http", "https"):
         raise StatusError(f"write the registry's URL as http://HOST:PORT; for the service's token there is {VARIABLE}")
     return url.rstrip("/")
-
-
-def _default_cache() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tandem" / "registries"

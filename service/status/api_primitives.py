@@ -116,12 +116,13 @@ def primitives_router(registry: Registry) -> APIRouter:
 
 
 class Shelf:
-    """Reads two registries as one, as `find_version` does: what the first one has hides the same of the second."""
+    """Reads two registries as one, as `find_version` does: what the user's has hides the same of the package's."""
 
     def __init__(self, registry: Registry) -> None:
-        self.registries: dict[Origin, Registry] = {"registry": registry}
-        if not is_bundled(registry):
-            self.registries["bundled"] = Registry(BUNDLED)
+        self.registries: dict[Origin, Registry] = {"bundled": Registry(BUNDLED), "registry": registry}
+        """The one that counts is the last, as of equal keys in a dictionary."""
+        if is_bundled(registry):
+            del self.registries["bundled"]
 
     def names(self) -> list[str]:
         """Every name that has a version, sorted."""
@@ -129,59 +130,47 @@ class Shelf:
 
     def summary(self, name: str) -> PrimitiveSummary:
         """What there is of a name that has a version."""
-        numbers = [version.number for _, version in self._versions(name)]
-        aliases = {alias: version.number for alias, (_, version) in self._aliases(name).items()}
-        there = tuple(origin for origin, registry in self.registries.items() if registry.versions(name))
+        origins = self._origins(name)
         return PrimitiveSummary(
             name=name,
-            num_versions=len(numbers),
-            newest=max(numbers),
-            aliases=dict(sorted(aliases.items())),
-            origins=there,
+            num_versions=len(origins),
+            newest=max(origins),
+            aliases={alias: number for alias, (_, number) in sorted(self._aliases(name).items())},
+            origins=tuple(origin for origin in reversed(self.registries) if self.registries[origin].versions(name)),
         )
 
     def versions(self, name: str) -> tuple[VersionSummary, ...]:
         """The versions of a name, newest first."""
         aliases = self._aliases(name)
-        found = sorted(self._versions(name), key=lambda each: each[1].number, reverse=True)
         return tuple(
-            self._describe(origin, version, [alias for alias, means in aliases.items() if means == (origin, version)])
-            for origin, version in found
+            self._describe(
+                origin, Version(name, number), [each for each in aliases if aliases[each] == (origin, number)]
+            )
+            for number, origin in sorted(self._origins(name).items(), reverse=True)
         )
 
-    def _last_first(self) -> list[tuple[Origin, Registry]]:
-        """The registries, so that in a dictionary the first one's entry is put last and counts."""
-        return list(reversed(self.registries.items()))
+    def _origins(self, name: str) -> dict[int, Origin]:
+        """Where each version is."""
+        registries = self.registries.items()
+        return {version.number: origin for origin, registry in registries for version in registry.versions(name)}
 
-    def _versions(self, name: str) -> list[tuple[Origin, Version]]:
-        found = {
-            version.number: (origin, version)
-            for origin, registry in self._last_first()
-            for version in registry.versions(name)
-        }
-        return list(found.values())
-
-    def _aliases(self, name: str) -> dict[str, tuple[Origin, Version]]:
+    def _aliases(self, name: str) -> dict[str, tuple[Origin, int]]:
+        """Where the version of each alias is, and its number."""
         return {
-            alias: (origin, Version(name, number))
-            for origin, registry in self._last_first()
+            alias: (origin, number)
+            for origin, registry in self.registries.items()
             for alias, number in registry.aliases(name).items()
         }
 
     def _describe(self, origin: Origin, version: Version, aliases: list[str]) -> VersionSummary:
         registry = self.registries[origin]
-        place: dict[str, object] = {
-            "version": version.number,
-            "aliases": tuple(aliases),
-            "origin": origin,
-            "directory": str(registry.root),
-        }
         try:
             manifest = registry.manifest(str(version))
+            said = manifest.model_dump(include=set(VersionSummary.model_fields) - {"version"}) | _lineage(manifest)
         except (DamagedBlobError, FormatVersionError) as error:  # must not hide the other versions
-            return VersionSummary.model_validate({**place, "problem": str(error)})
-        shown = manifest.model_dump(include=set(VersionSummary.model_fields) - {"version"})
-        return VersionSummary.model_validate({**place, **shown, **_lineage(manifest)})
+            said = {"problem": str(error)}
+        place = {"version": version.number, "origin": origin, "directory": str(registry.root)}
+        return VersionSummary.model_validate({**place, "aliases": aliases, **said})
 
 
 def _lineage(manifest: Manifest) -> dict[str, str | None]:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import hmac
-
 from fastapi import APIRouter, Request, Response
 
 from service.base.errors import TandemError
 from service.registry.registry import Registry
-from service.registry.token import SESSION_COOKIE, session_secret
+from service.registry.token import SESSION_COOKIE, check_authorization, session_secret
 from service.status.auth import TRUSTED
 from service.status.metrics import CONTENT_TYPE, Telemetry
 from service.status.openapi import INVALID, READ_ONLY, SECURITY, problems
@@ -69,7 +67,7 @@ def service_router(runs: RunReader, registry: Registry, telemetry: Telemetry, to
         """Sets a cookie for this browser, with which it may read; it does not hold the token, and ends with it."""
         if token is None:
             raise ProblemError(403, "read-only", "this service has no token: everybody on its machine may read")
-        if not hmac.compare_digest(entry.token.strip().encode(), token.encode()):
+        if check_authorization(f"Bearer {entry.token}", token) != "right":
             said = "wrong token: enter the one that this service was started with"
             raise ProblemError(401, "wrong-token", said, {"WWW-Authenticate": 'Bearer realm="tandem"'})
         response.set_cookie(

@@ -78,7 +78,8 @@ class AuthMiddleware:
             await send(message)
 
         try:
-            await self._pass_on(inner, receive, answer)
+            inner[TRUSTED] = self._is_trusted(HTTPConnection(inner), scope["method"], scope["path"])
+            await self._app(inner, _bounded(receive), answer)
         except ProblemError as problem:
             await problem.response()(inner, receive, answer)
         except Exception as error:
@@ -91,19 +92,13 @@ class AuthMiddleware:
             unexpected = ProblemError(500, "failed", "an unforeseen error; the log of the service has more")
             await unexpected.response()(inner, receive, answer)
 
-    async def _pass_on(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Check a request and pass it on, or raise ``ProblemError``."""
-        request = HTTPConnection(scope)
+    def _is_trusted(self, request: HTTPConnection, method: str, path: str) -> bool:
+        """Whether an allowed request may see everything; raises ``ProblemError`` for one that is not allowed."""
         if not self._public and not is_loopback(_host(request.headers.get("host", ""))):
             # otherwise a web site whose name resolves to 127.0.0.1 could read this service
             raise ProblemError(
                 421, "wrong-host", "ask for localhost or 127.0.0.1: this service is for its machine alone"
             )
-        scope[TRUSTED] = self._is_trusted(request, scope["method"], scope["path"])
-        await self._app(scope, _bounded(receive), send)
-
-    def _is_trusted(self, request: HTTPConnection, method: str, path: str) -> bool:
-        """Whether an allowed request may see everything; raises ``ProblemError`` for one that is not allowed."""
         safe = method in _SAFE
         if (safe and (path in OPEN or path.startswith(OPEN_FOLDER))) or path == SESSION:
             return False
