@@ -61,13 +61,6 @@ def test_versions_aliases_and_references(registry: Registry, publish: Publish) -
     assert registry.load("panda-cube@champion")[1]["gate.weight"][0, 0] == 2.0
 
 
-def test_publish_moves_only_latest(registry: Registry, publish: Publish) -> None:
-    publish()
-    registry.set_alias("panda-cube", "candidate", 1)
-    publish()
-    assert registry.aliases("panda-cube") == {"candidate": 1, "latest": 2}
-
-
 def test_equal_parameters_share_one_blob_but_not_a_version(registry: Registry, publish: Publish) -> None:
     assert publish().number == 1
     assert publish().number == 2

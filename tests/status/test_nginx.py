@@ -123,21 +123,6 @@ def test_clients_that_do_not_go_on(client, service, crowd, request_):
     assert_others_are_served(client, service)
 
 
-def test_clients_that_read_nothing_and_make_up_names(client, service, crowd):
-    for index in range(NUM_CLIENTS // 4):
-        request = f"GET /page/plotly.js?{index} HTTP/1.1\r\n".encode() + HEAD + b"\r\n"
-        crowd(data=request, source=f"127.1.0.{1 + index}")
-    assert_others_are_served(client, service)
-
-
-def test_heads_that_are_too_large(client, service, crowd):
-    """The service itself would take them."""
-    head = b"GET /livez HTTP/1.1\r\n" + HEAD + b"connection: close\r\n" + (b"x: " + b"a" * 5000 + b"\r\n") * 10
-    for connection in crowd(50, data=head + b"\r\n"):
-        assert received(connection)[:12] in (b"HTTP/1.1 400", b"")  # or the answer was lost, as nginx had closed
-    assert_others_are_served(client, service)
-
-
 def test_one_address_has_only_so_many_connections(client, service, crowd):
     half = b"POST /v1/session HTTP/1.1\r\n" + HEAD + b"content-length: 100\r\n\r\n{"
     refused = set()
