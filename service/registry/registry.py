@@ -25,7 +25,7 @@ from service.base import tensors
 from service.base.errors import RegistryError, StorageError, UnknownVersionError, did_you_mean
 from service.base.files import os_errors, write_atomic, write_exclusive
 from service.base.git import git_commit
-from service.base.regular_files import read_regular
+from service.base.regular_files import open_to_append, read_regular
 from service.registry import names
 from service.registry.blobs import BlobStore, sha256_of
 from service.registry.manifest import Manifest, make_manifest, read_manifest
@@ -266,7 +266,7 @@ class Registry:
         path = directory / names.check_alias(alias)
         with os_errors("write", path):
             directory.mkdir(parents=True, exist_ok=True)
-            with (directory / ".lock").open("a") as lock:
+            with open_to_append(directory / ".lock") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)  # closing the file frees it, and so does the process's death
                 if back or (self._read_alias(name, alias) or 0) < number:
                     write_atomic(path, f"{number}\n".encode())

@@ -8,10 +8,13 @@ from pathlib import Path
 from typing import Literal
 
 from service.base.errors import StatusError
+from service.base.regular_files import read_regular
 
 VARIABLE = "TANDEM_TOKEN"
 SESSION_COOKIE = "tandem_session"
 MIN_CHARACTERS = 16
+MAX_BYTES = 4096
+"""Of its file."""
 _MAKE = "make one with: openssl rand -hex 32"
 
 
@@ -25,7 +28,7 @@ def read_token(file: Path | None = None) -> str | None:
         text, source = os.environ.get(VARIABLE, ""), VARIABLE
         return check_token(text.strip(), source) if text.strip() else None
     try:
-        text = file.read_text("ascii", errors="replace")
+        text = read_regular(file, MAX_BYTES, follow=True).decode("ascii", errors="replace")
     except OSError as error:
         raise StatusError(f"--token-file {file}: {error.strerror}; name a file that holds one token") from None
     return check_token(text.strip(), f"--token-file {file}")

@@ -67,12 +67,8 @@ def test_a_head_that_is_too_large_is_refused_before_it_is_whole(server):
 def test_it_is_alive_while_every_thread_waits_for_a_file(server, monkeypatch):
     waiting, over = threading.Semaphore(0), threading.Event()
     monkeypatch.setattr(DiskReader, "run", lambda *_: waiting.release() or over.wait(60.0))
-    asking = [
-        threading.Thread(
-            target=httpx.get, args=(f"{server.url}/v1/runs/{number}",), kwargs={"headers": BEARER, **CLIENT}
-        )
-        for number in range(60)
-    ]
+    client = httpx.Client(base_url=server.url, headers=BEARER, **CLIENT)
+    asking = [threading.Thread(target=client.get, args=(f"/v1/runs/{number}",)) for number in range(60)]
     for thread in asking:
         thread.start()
     for _ in range(40):  # as many as there are threads for files
@@ -81,6 +77,7 @@ def test_it_is_alive_while_every_thread_waits_for_a_file(server, monkeypatch):
     over.set()
     for thread in asking:
         thread.join()
+    client.close()
 
 
 @pytest.mark.parametrize("what", ["link", "fifo", "directory"])
