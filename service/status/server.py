@@ -134,8 +134,8 @@ class StatusServer:
 def _listen(host: str, port: int) -> socket.socket:
     try:
         return listen(host, port)
-    except (OSError, OverflowError, UnicodeError) as error:
-        if getattr(error, "errno", None) == errno.EADDRINUSE:
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
             reason = f"port {port} of {host} is taken; stop what listens there, or choose another with --port"
         else:
             reason = f"cannot listen at {host!r} port {port}: {error}; name an address of this machine with --host"
