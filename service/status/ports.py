@@ -20,8 +20,6 @@ def listen(host: str, port: int) -> socket.socket:
         return socket.create_server(address, family=family, dualstack_ipv6=family == socket.AF_INET6)
     except UnicodeError as error:  # such as of two dots in a row
         raise OSError(errno.EINVAL, f"{host!r} is no name of a host") from error
-    except OverflowError as error:
-        raise OSError(errno.EINVAL, str(error)) from error
 
 
 def free_port(host: str, first: int = 0) -> int:

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.cluster.ray_connection import StatusOptions, parse_status
 from service.cluster.status_actor import place
-from service.status.ports import DEFAULT_PORT, free_port, listen
+from service.status.ports import DEFAULT_PORT, free_port
 
 
 @contextmanager
@@ -65,8 +65,3 @@ def test_a_run_on_ray_does_the_same(caplog):
         assert caplog.messages == [f"port {port} is taken, so the status service is at port {placed.port}"]
         named = StatusOptions(port=port)
         assert place(named) == named  # which fails when it is started
-
-
-def test_a_port_that_is_none():
-    with pytest.raises(OSError, match="0-65535"):
-        listen("127.0.0.1", 70_000)
