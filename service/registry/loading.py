@@ -271,10 +271,16 @@ def _load_version(reference: str, registry: Path | str, primitives: str | None) 
     kind = manifest.spaces.get("kind", PRIMITIVES)
     if kind == ORCHESTRATOR:
         spaces: dict[str, Any] = dict(manifest.spaces)
-        trained = _find_frozen(label, spaces["primitives"], spaces["primitives_digest"], (registry, primitives))
-        policy = _learned(parameters, trained, trained.config, spaces["hold_steps"])
-        about: dict[str, Any] = {"task": spaces["task"], "method": spaces["method"], "trained": trained}
-        return Trained(label, ORCHESTRATOR, trained.config, policy, parameters, manifest, path, **about)
+        try:
+            name, digest, hold_steps = spaces["primitives"], spaces["primitives_digest"], spaces["hold_steps"]
+            about: dict[str, Any] = {"task": spaces["task"], "method": spaces["method"]}
+        except KeyError as error:
+            raise TandemError(f"{label}: its manifest lacks {error}; publish it again") from None
+        trained = _find_frozen(label, name, digest, (registry, primitives))
+        policy = _learned(parameters, trained, trained.config, hold_steps)
+        return Trained(
+            label, ORCHESTRATOR, trained.config, policy, parameters, manifest, path, trained=trained, **about
+        )
     config = acting_config(manifest.config, where=f"the manifest of {reference}")
     try:
         if isinstance(config, SkillDiscoveryConfig):
