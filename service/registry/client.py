@@ -111,6 +111,8 @@ def _refusal(base: str, response: httpx.Response) -> TandemError:
         return WrongTokenError(f"{detail}; set {VARIABLE} to it and {URL_VARIABLE} to this URL, or give token=")
     if problem["type"] == "urn:tandem:unknown-version":
         return UnknownVersionError(detail)
+    if problem["type"] == "urn:tandem:damaged":
+        return DamagedBlobError(detail)
     return FetchError(detail)
 
 
