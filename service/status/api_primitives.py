@@ -88,7 +88,7 @@ def primitives_router(registry: Registry) -> APIRouter:
     )
     def get_blob(request: Request, digest: _Digest) -> Response:
         """Checked against the digest, which is also the entity tag; a blob never changes."""
-        for place in shelf.registries.values():
+        for place in reversed(shelf.registries.values()):
             path = BlobStore(place.root / "blobs").path(digest)
             try:
                 status = os.stat(path)
