@@ -19,8 +19,8 @@ from service.base.extras import MissingPackageError, needs_extra
 from service.config import load_config
 from service.config.recipes import recipes, robots
 from service.policies.numpy_policy import NumpyMCPPolicy
-from service.registry.acting import acting_config
 from service.registry.bundled import BUNDLED
+from service.registry.manifest import acting_config
 from service.registry.registry import Registry
 from tests.registry.helpers import files_in
 from tools.wheel_in_empty_environment import build_wheel

@@ -22,10 +22,10 @@ from service.base import tensors
 from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
 from service.policies.numpy_policy import NumpyMCPPolicy
-from service.registry.acting import acting_config
 from service.registry.blobs import BlobStore
 from service.registry.bundled import BUNDLED
 from service.registry.loading import read_stages
+from service.registry.manifest import acting_config
 from service.registry.names import LATEST, Version
 from service.registry.publishing import measure_bob, publish
 from service.registry.registry import Registry

@@ -112,8 +112,8 @@ def verify(
     """Check every byte against its digest, and every parameter; exit code 1 when something is damaged."""
     from service.base.errors import RegistryError
     from service.registry.bundled import find_version
+    from service.registry.loading import network_problems
     from service.registry.registry import Registry
-    from service.registry.verification import network_problems
 
     if reference is not None:
         registry, version = find_version(reference, directory)
@@ -183,8 +183,7 @@ def card(
 
 def _summary(registry: Registry, manifest: Manifest) -> dict[str, Any]:
     """A version's row in the list; two registries may both have a version 1, so it says where this one is."""
-    from service.registry.bundled import is_bundled
-    from service.registry.exported import ExportedVersion
+    from service.registry.bundled import ExportedVersion, is_bundled
 
     exported = isinstance(registry, ExportedVersion)
     return {

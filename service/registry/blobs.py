@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 from pathlib import Path
 
@@ -30,18 +29,16 @@ class BlobStore:
             StorageError: the disk is full or cannot be written; nothing is left behind.
         """
         digest = sha256_of(data)
-        path = self.path(digest)
-        with os_errors("write", path):
-            if not (_has_size(path, len(data)) and sha256_of(read_regular(path, len(data), follow=True)) == digest):
+        try:
+            self.get(digest)
+        except DamagedBlobError:  # or not there yet
+            path = self.path(digest)
+            with os_errors("write", path):
                 write_atomic(path, data)
         return digest
 
-    def get(self, digest: str, max_bytes: int = MAX_BYTES) -> bytes:
-        """The bytes of that digest, verified.
-
-        Args:
-            digest: their sha256 in hex.
-            max_bytes: that there may be of them; more are not read.
+    def get(self, digest: str) -> bytes:
+        """The bytes of that sha256 in hex, verified.
 
         Raises:
             DamagedBlobError: the file is missing or holds other bytes.
@@ -50,30 +47,21 @@ class BlobStore:
         path = self.path(digest)
         with os_errors("read", path):
             try:
-                data = read_regular(path, min(max_bytes, MAX_BYTES), follow=True)
+                data = read_regular(path, MAX_BYTES, follow=True)
             except FileNotFoundError:
                 raise DamagedBlobError(f"blob {path} is missing; {_MEND}") from None
-            except OSError as error:
-                if error.errno != errno.EFBIG:
-                    raise
-                raise DamagedBlobError(f"{path} is damaged: it is {error.strerror}; {_MEND}") from None
         check_digest(path, data, digest)
         return data
 
 
-def _has_size(path: Path, num_bytes: int) -> bool:
-    """Whether a file of that size is there: of one that was damaged, not even a part has to be read."""
-    return path.is_file() and path.stat().st_size == num_bytes
-
-
-def check_digest(path: Path, data: bytes, digest: str) -> None:
-    """Check that the bytes read from ``path`` are those of ``digest``.
+def check_digest(place: Path | str, data: bytes, digest: str) -> None:
+    """Check that the bytes read from ``place`` are those of ``digest``.
 
     Raises:
         DamagedBlobError: they are not.
     """
     if (actual := sha256_of(data)) != digest:
-        raise DamagedBlobError(f"{path} is damaged: expected sha256 {digest}, it has {actual}; {_MEND}")
+        raise DamagedBlobError(f"{place} is damaged: expected sha256 {digest}, it has {actual}; {_MEND}")
 
 
 def sha256_of(data: bytes) -> str:

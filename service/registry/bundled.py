@@ -1,13 +1,17 @@
-"""The primitives that come with the package, and the look-up of a reference in both registries."""
+"""The look-up of a reference: in the user's registry, and among the primitives that come with the package.
+
+What ``Registry.export`` wrote is looked up, too, as a registry of that one version.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from service.base.errors import UnknownVersionError, did_you_mean
-from service.registry.exported import ExportedVersion, is_exported
+from service.registry.blobs import BlobStore
+from service.registry.manifest import read_manifest
 from service.registry.names import Version, is_service, split_reference
-from service.registry.registry import Registry
+from service.registry.registry import EXPORTED_MANIFEST, EXPORTED_PARAMETERS, Registry
 
 BUNDLED = Path(__file__).parent / "data"
 """The registry that comes with the package; it is only read."""
@@ -42,18 +46,65 @@ def find_version(reference: str, root: Path | str) -> tuple[Registry, Version]:
         name, target = split_reference(reference)
         if is_bundled(own) or target in own.aliases(name):
             raise
-        if not bundled.versions(name):
-            raise UnknownVersionError(
-                f"{error}; with tandem comes: {', '.join(bundled.names()) or 'nothing'}"
-                f"{did_you_mean(name, [*own.names(), *bundled.names()])}"
-            ) from None
-        missing = str(error) if own.versions(name) else f"the registry {own.root} has no {name} at all"
+        missing = str(error)
     try:
         return bundled, bundled.resolve(reference)
     except UnknownVersionError as error:
-        raise UnknownVersionError(f"{missing}; nor does one come with tandem: {error}") from None
+        if bundled.versions(name):
+            raise UnknownVersionError(f"{missing}; nor does one come with tandem: {error}") from None
+        hint = did_you_mean(name, [*own.names(), *bundled.names()])
+        raise UnknownVersionError(f"{missing}; with tandem comes: {', '.join(bundled.names())}{hint}") from None
 
 
 def is_bundled(registry: Registry) -> bool:
     """Whether this is the registry that comes with the package."""
     return registry.root.resolve() == BUNDLED.resolve()
+
+
+def is_exported(path: Path) -> bool:
+    """Whether a directory holds an exported version."""
+    return (path / EXPORTED_MANIFEST).exists()
+
+
+class ExportedVersion(Registry):
+    """The version in a directory, under the name and number that it has in the registry it comes from.
+
+    Args:
+        root: the directory.
+
+    Raises:
+        StorageError: its manifest is damaged, or cannot be read.
+    """
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self._file = root / EXPORTED_MANIFEST
+        manifest = read_manifest(self._file)
+        self.version = Version(manifest.name, manifest.version)
+        self._blobs = _OneBlob(root)
+
+    def check_writable(self) -> None:
+        """Refuse: see ``Registry.check_writable``."""
+        raise self.only_read()
+
+    def names(self) -> list[str]:
+        """The version's name."""
+        return [self.version.name]
+
+    def versions(self, name: str) -> list[Version]:
+        """The version, if that is its name."""
+        return [self.version] if name == self.version.name else []
+
+    def aliases(self, name: str) -> dict[str, int]:
+        """None: aliases are not exported."""
+        return {}
+
+    def _manifest_path(self, version: Version) -> Path:
+        return self._file if version == self.version else super()._manifest_path(version)
+
+
+class _OneBlob(BlobStore):
+    """Parameters in a file with a name of its own; what reads them checks their digest all the same."""
+
+    def path(self, digest: str) -> Path:
+        return self._directory / EXPORTED_PARAMETERS

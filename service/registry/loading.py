@@ -20,14 +20,13 @@ from service.config.task import TaskConfig
 from service.envs.observations import layouts
 from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
 from service.policies.frozen_skills import FrozenSkills, ZeroShotPolicy
+from service.policies.numpy_actor import numpy_actor
 from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy, NumpyPolicy, numpy_bob
 from service.policies.parameters import Parameters, PolicyError
-from service.registry.acting import acting_config
-from service.registry.bundled import BUNDLED, find_version, is_bundled
+from service.registry.bundled import BUNDLED, find_version, is_bundled, is_exported
 from service.registry.digest import parameters_digest
-from service.registry.exported import is_exported
 from service.registry.learned import LearnedPolicy
-from service.registry.manifest import Manifest
+from service.registry.manifest import Manifest, acting_config
 from service.store.checkpoints import Checkpoint, CheckpointStore, read_checkpoint
 from service.store.run_directory import Published, RunDirectory
 
@@ -41,8 +40,6 @@ PRIMITIVES: Kind = "primitives"
 SKILLS: Kind = "skills"
 """Part of a run's checkpoint that holds frozen skills, and kind in the spaces of their manifest."""
 ORCHESTRATOR: Kind = "orchestrator"
-_TRIAL_FILE = "cell.json"
-"""Is in the directories of downstream trainings of version 0.2."""
 _DESCRIPTION = "policy.json"
 """Is in the folders that ``tandem export`` writes."""
 _SHOWN = 12
@@ -232,8 +229,6 @@ def load(reference: str, registry: Path | str = "registry", primitives: str | No
     is_place = path.is_dir() or "/" in reference or (path.suffix == ".safetensors" and path.is_file())
     if is_exported(path) or not is_place:
         found = _load_version(reference, registry, primitives)
-    elif (path / _TRIAL_FILE).exists():
-        raise TandemError(f"{reference} is a downstream training of tandem 0.2: use tandem 0.2, or train it again")
     elif (path / _DESCRIPTION).exists():
         raise TandemError(
             f"{reference} is a folder of tandem export, made for use without tandem: name what it was made of, as its "
@@ -277,26 +272,48 @@ def _load_version(reference: str, registry: Path | str, primitives: str | None) 
     if kind == ORCHESTRATOR:
         spaces: dict[str, Any] = dict(manifest.spaces)
         try:
-            wanted = {"name": spaces["primitives"], "digest": spaces["primitives_digest"]}
-            task, method, hold_steps = spaces["task"], spaces["method"], int(spaces["hold_steps"])
-        except (KeyError, TypeError, ValueError) as error:
+            name, digest, hold_steps = spaces["primitives"], spaces["primitives_digest"], spaces["hold_steps"]
+            about: dict[str, Any] = {"task": spaces["task"], "method": spaces["method"]}
+        except KeyError as error:
             raise TandemError(f"{label}: its manifest lacks {error}; publish it again") from None
-        trained = _find_frozen(label, wanted, registry, primitives)
-        config, policy = trained.config, _learned(parameters, trained, trained.config, hold_steps)
+        trained = _find_frozen(label, name, digest, (registry, primitives))
+        policy = _learned(parameters, trained, trained.config, hold_steps)
         return Trained(
-            label, ORCHESTRATOR, config, policy, parameters, manifest, path, task=task, method=method, trained=trained
+            label, ORCHESTRATOR, trained.config, policy, parameters, manifest, path, trained=trained, **about
         )
     config = acting_config(manifest.config, where=f"the manifest of {reference}")
     try:
         if isinstance(config, SkillDiscoveryConfig):
-            player = ZeroShotPolicy(FrozenSkills(parameters, config.skills.method))
-            return Trained(label, SKILLS, config, player, parameters, manifest, path)
+            return Trained(label, SKILLS, config, _skills(config, parameters), parameters, manifest, path)
         if kind == PRIMITIVES:
             bob, networks = NumpyMCPPolicy(parameters), {"bob/policy": parameters}
             return Trained(label, PRIMITIVES, config, bob, parameters, manifest, path, networks)
     except PolicyError as error:
         raise TandemError(f"{label} holds no {kind}: {error}") from None
     raise TandemError(f"{label} is of the kind {kind!r}, which this tandem cannot load; load it with a newer one")
+
+
+def network_problems(manifest: Manifest, arrays: Parameters) -> list[str]:
+    """Tell what keeps a policy from being made of a version's parameters, in one line; empty when it can be made.
+
+    A manifest without networks in its configuration describes none, and nothing is asked of it.
+    """
+    try:
+        if manifest.spaces.get("kind") == ORCHESTRATOR:
+            numpy_actor(dict(arrays))
+        elif manifest.config.keys() & {"policy", "skills"}:
+            config = acting_config(manifest.config, where="its configuration")
+            if isinstance(config, SkillDiscoveryConfig):
+                _skills(config, arrays)
+            else:
+                NumpyMCPPolicy(arrays)
+    except TandemError as error:
+        return [str(error)]
+    return []
+
+
+def _skills(config: SkillDiscoveryConfig, parameters: Parameters) -> ZeroShotPolicy:
+    return ZeroShotPolicy(FrozenSkills(parameters, config.skills.method))
 
 
 def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tuple[Path | str, str | None]) -> Trained:
@@ -312,13 +329,11 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
         raise TandemError(f"{label} is a run of the method {config.method}, which makes nothing that can be loaded")
     parameters = parts[config.part]
     if isinstance(config, SkillDiscoveryConfig):
-        skills = ZeroShotPolicy(FrozenSkills(parameters, config.skills.method))
-        return Trained(label, SKILLS, config, skills, parameters, path=path)
+        return Trained(label, SKILLS, config, _skills(config, parameters), parameters, path=path)
     if isinstance(config, TaskConfig):
         trained = None
         if config.primitives_digest is not None:
-            wanted = {"name": config.primitives, "digest": config.primitives_digest}
-            trained = _find_frozen(label, wanted, *place)
+            trained = _find_frozen(label, config.primitives, config.primitives_digest, place)
         policy = _learned(parameters, trained, config, config.hold_steps)
         about: dict[str, Any] = {"task": config.task, "method": config.method, "trained": trained}
         return Trained(label, ORCHESTRATOR, config, policy, parameters, path=path, **about)
@@ -340,17 +355,14 @@ def _learned(parameters: Parameters, trained: Trained | None, config: Config, ho
     return LearnedPolicy(parameters, frozen, layouts(config.world), hold_steps)
 
 
-def _find_frozen(label: str, wanted: dict[str, Any], registry: Path | str, named: str | None) -> Trained:
+def _find_frozen(label: str, name: str, digest: str, place: tuple[Path | str, str | None]) -> Trained:
     """The primitives or skills of that digest: where they are said to be, in the registry, or what is bundled."""
-    try:
-        name, digest = str(wanted["name"]), str(wanted["digest"])
-    except (KeyError, TypeError):
-        raise TandemError(f"{label} does not say by name and digest what it acts with; train it again") from None
+    registry, named = place
     places: list[tuple[str, Path | str]] = [(named, registry)] if named else [(name, registry), (name, BUNDLED)]
     problems = []
-    for reference, place in places:
+    for reference, root in places:
         try:
-            trained = load(reference, place).expect(PRIMITIVES, SKILLS, by=label)
+            trained = load(reference, root).expect(PRIMITIVES, SKILLS, by=label)
         except TandemError as error:
             problems.append(str(error))
             continue

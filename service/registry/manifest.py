@@ -1,4 +1,8 @@
-"""Manifests: the description of a version, as JSON that carries its own digest."""
+"""Manifests: the description of a version, as JSON that carries its own digest.
+
+Of the configuration in it, only how the policy acts and is evaluated is read. So versions that any tandem has published
+load for ever, whatever keys learning has had.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +15,30 @@ from typing import Any
 from pydantic import Field, JsonValue, StrictInt, ValidationError
 
 from service.base.errors import DamagedBlobError, FormatVersionError, RegistryError
+from service.base.files import os_errors, read_regular
 from service.base.parsing import ParseError, parse_json
+from service.config import Config, parse_config
 from service.config.frozen import FrozenModel
+from service.config.tree import group_of
 
 FORMAT_VERSION = 1
 MAX_BYTES = 4 * 1024 * 1024
 """Of a manifest; usual are ten thousand."""
+ACTING = (
+    "name",
+    "world",
+    "policy",
+    "game.success_distance_m",
+    "game.bob_steps",
+    "game.bob_hold_steps",
+    "skills.method",
+    "skills.size",
+    "skills.episode_steps",
+    "skills.hidden_sizes",
+    "skills.sac.hidden_sizes",
+    "run.evaluation_steps",
+)
+"""Keys of a published configuration that are read; versions of before must have them by these names."""
 _DIGEST_KEY = "manifest_sha256"
 _MEND = "restore the file from a copy, or publish the version again"
 
@@ -83,7 +105,18 @@ def make_manifest(fields: Mapping[str, object]) -> Manifest:
     return manifest
 
 
-def parse_manifest(data: bytes, path: Path) -> Manifest:
+def read_manifest(path: Path) -> Manifest:
+    """Read and verify the manifest in a file.
+
+    Raises:
+        StorageError: it cannot be read; or as for ``parse_manifest``.
+    """
+    with os_errors("read", path):
+        data = read_regular(path, MAX_BYTES, follow=True)
+    return parse_manifest(data, path)
+
+
+def parse_manifest(data: bytes, path: Path | str) -> Manifest:
     """Read and verify a manifest; ``path`` is named in errors.
 
     Raises:
@@ -106,6 +139,30 @@ def parse_manifest(data: bytes, path: Path) -> Manifest:
     except ValidationError as error:
         first = error.errors()[0]
         raise DamagedBlobError(f"manifest {path} is not valid: {first['loc']}: {first['msg']}; {_MEND}") from None
+
+
+def acting_config(tree: dict[str, Any], *, where: str) -> Config:
+    """Read how a policy acts and is evaluated from a configuration that any version recorded.
+
+    Only ``ACTING`` is read. All else has its defaults, since it may be of a version with other keys.
+
+    Raises:
+        ConfigError: a value of ``ACTING`` that no version has written.
+    """
+    acting: dict[str, Any] = {}
+    for key in ACTING:
+        *groups, last = key.split(".")
+        found: Any = tree
+        for name in groups:
+            found = found.get(name) if isinstance(found, dict) else None
+        if isinstance(found, dict) and last in found:
+            group, name = group_of(acting, key, where=where)
+            group[name] = found[last]
+    if "skills" in acting:
+        acting["method"] = "skills"
+        acting.pop("policy", None)
+        acting.pop("game", None)
+    return parse_config(acting, where=where)
 
 
 def _digest(tree: dict[str, Any]) -> str:

@@ -12,7 +12,7 @@ from service.actors.evaluation import EVALUATED_GOALS, REPORTED_SEED, success_me
 from service.base import tensors
 from service.base.errors import StorageError, TandemError
 from service.config import Config
-from service.config.skills import SkillDiscoveryConfig, SkillsConfig
+from service.config.skills import SkillDiscoveryConfig
 from service.config.task import TaskConfig
 from service.envs.observations import POSITIONS, SPACES, layouts
 from service.policies.frozen_skills import FrozenSkills
@@ -156,17 +156,12 @@ def _described(config: Config) -> dict[str, Any]:
             "normalisation": {"made_by": num_inputs.__module__, "num_inputs": num_inputs(seen)[1]},
         }
     if isinstance(config, SkillDiscoveryConfig):
-        normalisation, spaces = POSITIONS.normalisation, skill_spaces(config.skills)
+        shared = {name: size for name, size in SPACES.items() if name != "observation"}
+        normalisation, spaces = POSITIONS.normalisation, {**shared, "kind": SKILLS, "skill": config.skills.size}
     else:
         normalisation, spaces = seen.bob.normalisation, seen.spaces
     constants = {"offset": normalisation.offset.tolist(), "scale": normalisation.scale.tolist()}
     return {"spaces": spaces, "normalisation": constants}
-
-
-def skill_spaces(skills: SkillsConfig) -> dict[str, object]:
-    """Sizes and layout in the manifest of frozen skills."""
-    shared = {name: size for name, size in SPACES.items() if name != "observation"}
-    return {**shared, "kind": SKILLS, "skill": skills.size}
 
 
 def newest_if_same(registry: Registry, name: str, parameters: Parameters) -> Version | None:

@@ -13,7 +13,8 @@ A publish writes the blob, then the manifest, then the aliases, each atomically:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import fcntl
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -21,15 +22,16 @@ from typing import Any
 import numpy as np
 
 from service.base import tensors
-from service.base.errors import DamagedBlobError, RegistryError, StorageError, UnknownVersionError, did_you_mean
-from service.base.files import os_errors, read_regular, write_atomic, write_exclusive
+from service.base.errors import RegistryError, StorageError, UnknownVersionError, did_you_mean
+from service.base.files import open_to_append, os_errors, read_regular, write_atomic, write_exclusive
 from service.base.version import git_commit
 from service.registry import names
-from service.registry.aliases import move_alias, read_alias, read_aliases
 from service.registry.blobs import BlobStore, sha256_of
-from service.registry.manifest import MAX_BYTES, Manifest, TensorDescription, make_manifest, parse_manifest
+from service.registry.manifest import Manifest, make_manifest, read_manifest
 from service.registry.names import LATEST, Version
 
+MAX_ALIAS_BYTES = 100
+"""Of an alias' file, which holds a number."""
 READ_ONLY_FILE = "READ_ONLY"
 EXPORTED_MANIFEST, EXPORTED_PARAMETERS = "manifest.json", "primitives.safetensors"
 """Files of an exported version."""
@@ -106,7 +108,7 @@ class Registry:
             "git_commit": git_commit(),
         }
         version = self._publish_version(name, parameters, fields)
-        move_alias(self._alias_directory(name), LATEST, version.number, back=False)
+        self._move_alias(name, LATEST, version.number, back=False)
         return version
 
     def resolve(self, reference: str) -> Version:
@@ -117,7 +119,7 @@ class Registry:
             RegistryError: not a reference, or a damaged alias.
         """
         name, target = names.split_reference(reference)
-        number = target if isinstance(target, int) else read_alias(self._alias_directory(name), target)
+        number = target if isinstance(target, int) else self._read_alias(name, target)
         if number is None or not self._manifest_path(Version(name, number)).exists():
             raise UnknownVersionError(self._describe_missing(name, target))
         return Version(name, number)
@@ -130,36 +132,16 @@ class Registry:
             DamagedBlobError: the manifest is damaged.
             FormatVersionError: the manifest is of another format.
         """
-        path = self._manifest_path(self.resolve(reference))
-        with os_errors("read", path):
-            data = read_regular(path, MAX_BYTES, follow=True)
-        return parse_manifest(data, path)
+        return read_manifest(self._manifest_path(self.resolve(reference)))
 
     def load(self, reference: str) -> tuple[Manifest, dict[str, np.ndarray]]:
         """The verified manifest and parameters of a version.
 
         Raises:
-            StorageError: as for `manifest`; DamagedBlobError also for damaged parameters, and for others than the
-                manifest describes.
+            StorageError: as for `manifest`; DamagedBlobError also for damaged parameters.
         """
         manifest = self.manifest(reference)
-        data = self._blobs.get(manifest.blob_sha256, max_bytes=manifest.blob_bytes)
-        path = self._blobs.path(manifest.blob_sha256)
-        try:
-            arrays = tensors.decode(data)
-        except ValueError as error:
-            raise DamagedBlobError(
-                f"{path}, parameters of {manifest.reference}, is {error}; publish them again"
-            ) from None
-        found = {name: TensorDescription(**each) for name, each in tensors.describe(arrays).items()}
-        for name in sorted(found.keys() | manifest.tensors.keys()):
-            there, described = (_described(tree.get(name)) for tree in (found, manifest.tensors))
-            if there != described:
-                raise DamagedBlobError(
-                    f"{path}: parameter {name!r} is {there}, but the manifest of {manifest.reference} says "
-                    f"{described}; publish the version again"
-                )
-        return manifest, arrays
+        return manifest, tensors.decode(self._blobs.get(manifest.blob_sha256))
 
     def names(self) -> list[str]:
         """Every name that has a version, sorted.
@@ -187,7 +169,10 @@ class Registry:
         Raises:
             RegistryError: an alias file is damaged.
         """
-        return read_aliases(self._alias_directory(name))
+        directory = self._alias_directory(name)
+        found = sorted(entry.name for entry in directory.iterdir()) if directory.is_dir() else []
+        numbers = {alias: self._read_alias(name, alias) for alias in found if names.is_name(alias)}
+        return {alias: number for alias, number in numbers.items() if number is not None}
 
     def set_alias(self, name: str, alias: str, version: int) -> Version:
         """Make or move ``alias`` of ``name`` to ``version``, forward or back.
@@ -199,11 +184,11 @@ class Registry:
         """
         self.check_writable()
         target = self.resolve(f"{name}@{version}")
-        move_alias(self._alias_directory(name), alias, version)
+        self._move_alias(name, alias, version)
         return target
 
     def verify(self, reference: str | None = None, check: Check = lambda manifest, arrays: []) -> list[str]:
-        """Read a version, or everything, and check each byte; and that every number is finite.
+        """Read a version, or everything, and check each byte.
 
         Args:
             reference: of the version; None for everything.
@@ -259,6 +244,32 @@ class Registry:
                 if write_exclusive(path, make_manifest({**fields, "version": version.number}).to_bytes()):
                     return version
 
+    def _read_alias(self, name: str, alias: str) -> int | None:
+        """The number ``alias`` means; None when there is no such alias."""
+        path = self._alias_directory(name) / names.check_alias(alias)
+        with os_errors("read", path):
+            try:
+                text = read_regular(path, MAX_ALIAS_BYTES, follow=True).decode("ascii", errors="replace").strip()
+            except FileNotFoundError:
+                return None
+        if not names.is_number(text):
+            raise RegistryError(f"alias {path} is damaged: it holds {text!r}; set it again with tandem registry alias")
+        return int(text)
+
+    def _move_alias(self, name: str, alias: str, number: int, *, back: bool = True) -> None:
+        """Make ``alias`` mean the version ``number``; any number of processes may do so at once.
+
+        Without ``back``, an alias of a greater number stays: a slow publisher cannot undo a later one.
+        """
+        directory = self._alias_directory(name)
+        path = directory / names.check_alias(alias)
+        with os_errors("write", path):
+            directory.mkdir(parents=True, exist_ok=True)
+            with open_to_append(directory / ".lock") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)  # closing the file frees it, and so does the process's death
+                if back or (self._read_alias(name, alias) or 0) < number:
+                    write_atomic(path, f"{number}\n".encode())
+
     def _problems_of(self, version: Version, check: Check) -> list[str]:
         try:
             manifest, arrays = self.load(str(version))
@@ -266,7 +277,7 @@ class Registry:
             return [f"{version}: {error}"]
         if (manifest.name, manifest.version) != version:
             return [f"{version}: its manifest is that of {manifest.reference}; restore the file from a copy"]
-        return [f"{version}: {problem}" for problem in (*_not_finite(arrays), *check(manifest, arrays))]
+        return [f"{version}: {problem}" for problem in check(manifest, arrays)]
 
     def _alias_problems(self, name: str) -> list[str]:
         numbers = {version.number for version in self.versions(name)}
@@ -302,13 +313,3 @@ class Registry:
 
     def _alias_directory(self, name: str) -> Path:
         return self._directory(name) / "aliases"
-
-
-def _described(tensor: TensorDescription | None) -> str:
-    return "missing" if tensor is None else f"{tensor.dtype} {list(tensor.shape)}"
-
-
-def _not_finite(arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
-    for name, array in arrays.items():
-        if array.dtype.kind in "fc" and (num := int((~np.isfinite(array)).sum())):
-            yield f"parameter {name!r} has {num} of {array.size} numbers that are not finite; use an earlier version"

@@ -28,12 +28,10 @@ def read_token(file: Path | None = None) -> str | None:
         text, source = os.environ.get(VARIABLE, ""), VARIABLE
         return check_token(text.strip(), source) if text.strip() else None
     try:
-        text = read_regular(file, MAX_BYTES, follow=True).decode("ascii")
-        return check_token(text.strip(), f"--token-file {file}")
+        text = read_regular(file, MAX_BYTES, follow=True).decode("ascii", errors="replace")
     except OSError as error:
         raise StatusError(f"--token-file {file}: {error.strerror}; name a file that holds one token") from None
-    except UnicodeDecodeError:
-        raise StatusError(f"--token-file {file} holds more than ASCII text; {_MAKE}") from None
+    return check_token(text.strip(), f"--token-file {file}")
 
 
 def check_token(token: str, source: str) -> str:

@@ -10,10 +10,11 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as InPath
 
-from service.base.errors import RegistryError
+from service.base.errors import DamagedBlobError, FormatVersionError, RegistryError
 from service.registry.blobs import BlobStore
-from service.registry.bundled import find_version
-from service.registry.names import NAME_PATTERN
+from service.registry.bundled import BUNDLED, find_version, is_bundled
+from service.registry.manifest import Manifest
+from service.registry.names import NAME_PATTERN, Version
 from service.registry.registry import Registry
 from service.status.files import BYTES, PARTS, file_response
 from service.status.openapi import INVALID, READ_ONLY, problems
@@ -22,10 +23,12 @@ from service.status.schemas import (
     AliasChange,
     AliasState,
     ManifestDocument,
+    Origin,
     PrimitiveList,
+    PrimitiveSummary,
     PrimitiveVersions,
+    VersionSummary,
 )
-from service.status.shelf import Shelf
 
 MAX_VERIFIED = 4096
 _FOREVER = "private, max-age=31536000, immutable"
@@ -85,7 +88,7 @@ def primitives_router(registry: Registry) -> APIRouter:
     )
     def get_blob(request: Request, digest: _Digest) -> Response:
         """Checked against the digest, which is also the entity tag; a blob never changes."""
-        for place in shelf.registries.values():
+        for place in reversed(shelf.registries.values()):
             path = BlobStore(place.root / "blobs").path(digest)
             try:
                 status = os.stat(path)
@@ -110,3 +113,76 @@ def primitives_router(registry: Registry) -> APIRouter:
         return AliasState(name=name, alias=alias, version=version.number)
 
     return router
+
+
+class Shelf:
+    """Reads two registries as one, as `find_version` does: what the user's has hides the same of the package's."""
+
+    def __init__(self, registry: Registry) -> None:
+        self.registries: dict[Origin, Registry] = {"bundled": Registry(BUNDLED), "registry": registry}
+        """The one that counts is the last, as of equal keys in a dictionary."""
+        if is_bundled(registry):
+            del self.registries["bundled"]
+
+    def names(self) -> list[str]:
+        """Every name that has a version, sorted."""
+        return sorted({name for registry in self.registries.values() for name in registry.names()})
+
+    def summary(self, name: str) -> PrimitiveSummary:
+        """What there is of a name that has a version."""
+        origins = self._origins(name)
+        return PrimitiveSummary(
+            name=name,
+            num_versions=len(origins),
+            newest=max(origins),
+            aliases={alias: number for alias, (_, number) in sorted(self._aliases(name).items())},
+            origins=tuple(origin for origin in reversed(self.registries) if self.registries[origin].versions(name)),
+        )
+
+    def versions(self, name: str) -> tuple[VersionSummary, ...]:
+        """The versions of a name, newest first."""
+        aliases = self._aliases(name)
+        return tuple(
+            self._describe(
+                origin, Version(name, number), [each for each in aliases if aliases[each] == (origin, number)]
+            )
+            for number, origin in sorted(self._origins(name).items(), reverse=True)
+        )
+
+    def _origins(self, name: str) -> dict[int, Origin]:
+        """Where each version is."""
+        registries = self.registries.items()
+        return {version.number: origin for origin, registry in registries for version in registry.versions(name)}
+
+    def _aliases(self, name: str) -> dict[str, tuple[Origin, int]]:
+        """Where the version of each alias is, and its number."""
+        return {
+            alias: (origin, number)
+            for origin, registry in self.registries.items()
+            for alias, number in registry.aliases(name).items()
+        }
+
+    def _describe(self, origin: Origin, version: Version, aliases: list[str]) -> VersionSummary:
+        registry = self.registries[origin]
+        try:
+            manifest = registry.manifest(str(version))
+            said = manifest.model_dump(include=set(VersionSummary.model_fields) - {"version"}) | _lineage(manifest)
+        except (DamagedBlobError, FormatVersionError) as error:  # must not hide the other versions
+            said = {"problem": str(error)}
+        place = {"version": version.number, "origin": origin, "directory": str(registry.root)}
+        return VersionSummary.model_validate({**place, "aliases": aliases, **said})
+
+
+def _lineage(manifest: Manifest) -> dict[str, str | None]:
+    """What a manifest says of where its version comes from; fields that it may have or not, whatever its kind."""
+    spaces = manifest.spaces
+
+    def text(*values: object) -> str | None:
+        return next((value for value in values if isinstance(value, str) and value), None)
+
+    return {
+        "kind": text(spaces.get("kind")) or "primitives",
+        "task": text(spaces.get("task")),
+        "primitives": text(spaces.get("primitives"), manifest.config.get("primitives")),
+        "run": text((manifest.history or {}).get("run")),
+    }

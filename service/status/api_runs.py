@@ -1,4 +1,4 @@
-"""Routes ``/v1/runs``: progress of runs, and stopping them."""
+"""Routes ``/v1/runs``, ``/v1/series`` and ``/v1/downstream``: progress of runs, and stopping them."""
 
 # no postponed annotations: FastAPI could not resolve a dependency that is local to a function
 from collections.abc import AsyncIterator
@@ -7,8 +7,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi import Path as InPath
+from fastapi.responses import StreamingResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from service.base.errors import StoreError
@@ -16,29 +18,48 @@ from service.status import run_details, series
 from service.status.files import BYTES, PARTS, RUN_FILES, RunDirectories, file_response, kind_of
 from service.status.openapi import INVALID, READ_ONLY, UNAVAILABLE, UNKNOWN_RUN, problems
 from service.status.problems import ProblemError
-from service.status.schemas import GoalFrames, MetricHistory, RunFiles, RunList, RunLog, RunSetup
+from service.status.schemas import (
+    Axis,
+    GoalFrames,
+    MetricHistory,
+    RunFiles,
+    RunList,
+    RunLog,
+    RunSetup,
+    SeriesSet,
+    TaskTable,
+)
 from service.status.stream import EVENT_SCHEMA, RunFollower, Streams
-from service.store.models import ACTIVE, GoalGrid, RunReader, RunStatus
+from service.status.task_table import task_table
+from service.store.models import ACTIVE, RUN_ID, GoalGrid, RunReader, RunStatus
 
 MAX_ITERATION = 2**53 - 1
+MAX_SERIES_RUNS = 200
 _SPARKLINE_POINTS = 40
 _MAX_SPARKLINES = 2000
-_Run = Annotated[
-    str,
-    InPath(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,127}$", description="id of a run", examples=["cube"]),
-]
+_Run = Annotated[str, InPath(pattern=RUN_ID, description="id of a run", examples=["cube"])]
 _Metric = Annotated[str, Query(min_length=1, max_length=128)]
 _Names = Annotated[
     list[_Metric] | None,
     Query(max_length=100, description="of metrics, repeatable; all if left out", examples=[["bob/success_rate"]]),
 ]
 _After = Annotated[int, Query(ge=0, le=MAX_ITERATION, description="only later iterations")]
+_Runs = Annotated[
+    list[Annotated[str, Query(pattern=RUN_ID)]],
+    Query(alias="runs", min_length=1, max_length=MAX_SERIES_RUNS, description="ids, repeatable", examples=[["cube"]]),
+]
+_SeriesNames = Annotated[
+    list[_Metric],
+    Query(min_length=1, max_length=100, description="of metrics, repeatable", examples=[["bob/success_rate"]]),
+]
+_Bound = Annotated[float | None, Query(ge=-1e15, le=1e15, allow_inf_nan=False)]
 _MaxPoints = Annotated[int, Query(ge=1, le=10_000, description="down-sample to at most this many points")]
 
 
 def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, registry: Path) -> APIRouter:
     """Make the routes about runs; ``registry`` is the root of the one that commands name."""
-    router = APIRouter(prefix="/v1/runs", tags=["runs"])
+    router = APIRouter(tags=["runs"])
+    read = problems(INVALID, UNAVAILABLE)
     errors = problems(UNKNOWN_RUN, INVALID, UNAVAILABLE)
 
     @lru_cache(_MAX_SPARKLINES)
@@ -49,7 +70,7 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
                 return values
         return ()
 
-    @router.get("", summary="All runs", responses=problems(INVALID, UNAVAILABLE))
+    @router.get("/v1/runs", summary="All runs", responses=read)
     def list_runs(
         active: Annotated[bool | None, Query(description="only runs in progress, or only those that ended")] = None,
         limit: Annotated[int, Query(ge=1, le=1000)] = 100,
@@ -76,12 +97,12 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
                 sparklines[run.run_id] = sparkline(run.run_id, tuple(sparkline_of or ()), run.started, run.iteration)
         return RunList(runs=tuple(found[:limit]), num_runs=len(found), sparklines=sparklines)
 
-    @router.get("/{run_id}", summary="One run", responses=errors)
+    @router.get("/v1/runs/{run_id}", summary="One run", responses=errors)
     def get_run(run_id: _Run) -> RunStatus:
         """State, progress, rates, policy lag, actors with their heartbeats, the last error."""
         return runs.run(run_id)
 
-    @router.get("/{run_id}/metrics", summary="A run's metrics so far", responses=errors)
+    @router.get("/v1/runs/{run_id}/metrics", summary="A run's metrics so far", responses=errors)
     def get_metrics(
         run_id: _Run, names: _Names = None, after_iteration: _After = 0, max_points: _MaxPoints = 1000
     ) -> MetricHistory:
@@ -92,21 +113,21 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
         run_id: _Run,
         names: _Names = None,
         after_iteration: Annotated[
-            int | None, Query(ge=0, le=MAX_ITERATION, description="begin after it; with the newest if left out")
+            int | None,
+            Query(ge=0, le=MAX_ITERATION, description="begin after it; with the newest if left out"),
         ] = None,
         last_event_id: Annotated[
-            int | None, Header(ge=0, le=MAX_ITERATION, description="sent by browsers; overrides after_iteration")
+            int | None,
+            Header(ge=0, le=MAX_ITERATION, description="sent by browsers; overrides after_iteration"),
         ] = None,
     ) -> AsyncIterator[RunFollower]:
         # a dependency, because an error in the route itself would come after the headers of the answer
-        follower = await streams.follow(run_id, names, after_iteration if last_event_id is None else last_event_id)
-        try:
+        after = after_iteration if last_event_id is None else last_event_id
+        async with streams.follow(run_id, names, after) as follower:
             yield follower
-        finally:  # also where a client went in the midst of an event
-            follower.release()
 
     @router.get(
-        "/{run_id}/metrics/stream",
+        "/v1/runs/{run_id}/metrics/stream",
         summary="Events of a run in progress",
         response_class=EventSourceResponse,
         responses={
@@ -120,7 +141,7 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
             yield event
 
     @router.get(
-        "/{run_id}/goals",
+        "/v1/runs/{run_id}/goals",
         summary="The task generator's grid of goals",
         responses=problems((404, "There is no such run, or it has no grid yet."), INVALID, UNAVAILABLE),
     )
@@ -133,25 +154,25 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
             )
         return grid
 
-    @router.get("/{run_id}/goals/history", summary="How goals and their difficulty changed", responses=errors)
+    @router.get("/v1/runs/{run_id}/goals/history", summary="How goals and their difficulty changed", responses=errors)
     def get_goal_history(run_id: _Run, frames: Annotated[int, Query(ge=1, le=60)] = 24) -> GoalFrames:
         """From the sample of goals that a run records: cells, and how often Bob reached their goals, part by part."""
         runs.run(run_id)
         return run_details.goal_frames(directories.directory(run_id), runs.goals(run_id), frames)
 
-    @router.get("/{run_id}/setup", summary="A run's configuration and commands", responses=errors)
+    @router.get("/v1/runs/{run_id}/setup", summary="A run's configuration and commands", responses=errors)
     def get_setup(run_id: _Run) -> RunSetup:
         """The resolved configuration, the directory, and the commands that stop the run, resume it or use it."""
         return run_details.setup(runs.run(run_id), directories.directory(run_id), registry)
 
-    @router.get("/{run_id}/log", summary="What happened to a run", responses=errors)
+    @router.get("/v1/runs/{run_id}/log", summary="What happened to a run", responses=errors)
     def get_log(run_id: _Run, limit: Annotated[int, Query(ge=1, le=10_000)] = 500) -> RunLog:
         """Who died, who came back, what went wrong, and what its processes said, oldest first."""
         runs.run(run_id)
         return run_details.log(directories.directory(run_id), limit)
 
     @router.post(
-        "/{run_id}/stop",
+        "/v1/runs/{run_id}/stop",
         summary="Ask a run to end",
         status_code=202,
         responses={**errors, **problems(READ_ONLY)},
@@ -161,14 +182,14 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
         runs.request_stop(run_id)
         return runs.run(run_id)
 
-    @router.get("/{run_id}/files", summary="A run's pictures and videos", responses=errors)
+    @router.get("/v1/runs/{run_id}/files", summary="A run's pictures and videos", responses=errors)
     def list_files(run_id: _Run) -> RunFiles:
         """The files that exist at the moment."""
         runs.run(run_id)
         return RunFiles(files=tuple(directories.files(run_id)))
 
     @router.get(
-        "/{run_id}/files/{file}",
+        "/v1/runs/{run_id}/files/{file}",
         summary="A picture or a video",
         response_class=Response,
         responses={
@@ -184,7 +205,7 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
         return file_response(request, path, kind_of(file)[1], cache="private, no-cache")
 
     @router.get(
-        "/{run_id}/video",
+        "/v1/runs/{run_id}/video",
         summary="The newest video of a run",
         response_class=Response,
         responses={
@@ -197,5 +218,43 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
         """Alice beside Bob, random skills, or episodes of a downstream task: the first that `files` lists."""
         names = [file.name for file in directories.files(run_id) if file.media_type == "video/mp4"]
         return get_file(request, run_id, names[0] if names else "rounds.mp4")
+
+    @router.get("/v1/downstream", summary="Success of methods on downstream tasks", responses=problems(UNAVAILABLE))
+    def get_downstream() -> TaskTable:
+        """From the runs that learn a task: each cell is a mean over seeds, with its interval."""
+        return task_table(runs.runs(), directories.directories())
+
+    @router.get(
+        "/v1/series",
+        summary="Curves of runs, thinned",
+        response_class=Response,
+        response_model=None,
+        responses={200: {"model": SeriesSet, "description": "The curves."}, **read},
+    )
+    def get_series(
+        run_ids: _Runs,
+        names: _SeriesNames,
+        axis: Axis = "env_steps",
+        start: _Bound = None,
+        end: _Bound = None,
+        max_points: Annotated[int, Query(ge=20, le=10_000, description="of each curve")] = 1000,
+    ) -> Response:
+        """Of a part with more iterations than points, each point has the mean, the lowest and the highest of its own.
+
+        A run that cannot be read has a `problem`, and the others their curves. Fewer points where many are asked for.
+        """
+        found = series.series(runs, run_ids, names, axis, start, end, max_points)
+        return Response(msgspec.json.encode(found), media_type="application/json")
+
+    @router.get(
+        "/v1/series.csv",
+        summary="All values of metrics",
+        response_class=Response,
+        responses={200: {"content": {"text/csv": {"schema": {"type": "string"}}}, "description": "CSV."}, **read},
+    )
+    def get_table(run_ids: _Runs, names: _SeriesNames) -> StreamingResponse:
+        """A line for every iteration of every run, whole: `run`, `iteration`, `env_steps` and the metrics."""
+        headers = {"content-disposition": 'attachment; filename="metrics.csv"'}
+        return StreamingResponse(series.table(runs, run_ids, names), media_type="text/csv", headers=headers)
 
     return router

@@ -11,11 +11,11 @@ import logging
 import re
 import time
 from collections.abc import Callable
-from http.cookies import CookieError, SimpleCookie
 
 from anyio import BrokenResourceError
-from starlette.datastructures import Headers, MutableHeaders
+from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
+from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.registry.token import SESSION_COOKIE, VARIABLE, check_authorization, check_session
@@ -40,9 +40,8 @@ _HEADERS = {
     "referrer-policy": "no-referrer",
     "cross-origin-resource-policy": "same-origin",
     "cross-origin-opener-policy": "same-origin",
-    "cache-control": "no-store",
 }
-"""Headers of every answer that does not set them itself."""
+"""Headers of every answer."""
 _HOST = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([^:@/\[\]\s]+))(?::[0-9]{1,5})?")
 _logger = logging.getLogger(__name__)
 
@@ -72,13 +71,15 @@ class AuthMiddleware:
             if message["type"] == "http.response.start":
                 status = message["status"]
                 headers = MutableHeaders(scope=message)
-                for name, value in _HEADERS.items():
-                    headers.setdefault(name, value)
+                headers.update(_HEADERS)
+                # browsers revalidate the page each time, so that after an update none shows a mix of old and new files
+                headers.setdefault("cache-control", "no-cache" if scope["path"].startswith(OPEN_FOLDER) else "no-store")
                 self._observe(scope["method"], _template(inner), status, time.perf_counter() - begun_s)
             await send(message)
 
         try:
-            await self._pass_on(inner, receive, answer)
+            inner[TRUSTED] = self._is_trusted(HTTPConnection(inner), scope["method"], scope["path"])
+            await self._app(inner, _bounded(receive), answer)
         except ProblemError as problem:
             await problem.response()(inner, receive, answer)
         except Exception as error:
@@ -91,19 +92,13 @@ class AuthMiddleware:
             unexpected = ProblemError(500, "failed", "an unforeseen error; the log of the service has more")
             await unexpected.response()(inner, receive, answer)
 
-    async def _pass_on(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Check a request and pass it on, or raise ``ProblemError``."""
-        headers = Headers(scope=scope)
-        if not self._public and not is_loopback(_host(headers.get("host", ""))):
+    def _is_trusted(self, request: HTTPConnection, method: str, path: str) -> bool:
+        """Whether an allowed request may see everything; raises ``ProblemError`` for one that is not allowed."""
+        if not self._public and not is_loopback(_host(request.headers.get("host", ""))):
             # otherwise a web site whose name resolves to 127.0.0.1 could read this service
             raise ProblemError(
                 421, "wrong-host", "ask for localhost or 127.0.0.1: this service is for its machine alone"
             )
-        scope[TRUSTED] = self._is_trusted(scope["method"], scope["path"], headers)
-        await self._app(scope, _bounded(receive), send)
-
-    def _is_trusted(self, method: str, path: str, headers: Headers) -> bool:
-        """Whether an allowed request may see everything; raises ``ProblemError`` for one that is not allowed."""
         safe = method in _SAFE
         if (safe and (path in OPEN or path.startswith(OPEN_FOLDER))) or path == SESSION:
             return False
@@ -113,13 +108,14 @@ class AuthMiddleware:
             raise ProblemError(
                 403, "read-only", f"this service has no token and so changes nothing; start it with {VARIABLE} set"
             )
-        verdict = check_authorization(headers.get("authorization"), self._token)
-        if verdict == "missing" and safe and check_session(_cookie(headers), self._token):
+        verdict = check_authorization(request.headers.get("authorization"), self._token)
+        if verdict == "right":
             return True
-        if verdict == "right" or (verdict == "missing" and safe and not self._public):
-            return True
-        if verdict == "missing" and safe and path in PROBES:
-            return False
+        if verdict == "missing" and safe:
+            if not self._public or check_session(request.cookies.get(SESSION_COOKIE), self._token):
+                return True
+            if path in PROBES:
+                return False
         what = "a token is needed" if verdict == "missing" else "wrong token"
         raise ProblemError(
             401,
@@ -148,14 +144,6 @@ def _is_of_a_closed_connection(error: BaseException) -> bool:
     if isinstance(error, BaseExceptionGroup):
         return all(map(_is_of_a_closed_connection, error.exceptions))
     return isinstance(error, BrokenResourceError)
-
-
-def _cookie(headers: Headers) -> str | None:
-    try:
-        found = SimpleCookie(headers.get("cookie", "")).get(SESSION_COOKIE)
-    except CookieError:
-        return None
-    return found.value if found is not None else None
 
 
 def _template(scope: Scope) -> str:

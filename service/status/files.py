@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import re
-import stat
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from fastapi import Request
 from starlette.responses import FileResponse, Response
 from starlette.staticfiles import NotModifiedResponse, StaticFiles
 
-from service.base.files import open_regular
 from service.status.openapi import problems
 from service.status.problems import ProblemError
 from service.status.schemas import RunFile
@@ -41,7 +38,7 @@ PARTS: dict[int | str, dict[str, Any]] = {
     **problems((416, "The range lies beyond the file.")),
 }
 """Answers of a route that gives a file, in addition to 200."""
-_RANGE = re.compile(r"bytes=(?P<start>[0-9]{0,18})-(?P<end>[0-9]{0,18})")
+_RANGE = re.compile(r"bytes=([0-9]{1,18})-")
 _CONDITIONS = StaticFiles()
 """Only for its ``is_not_modified``."""
 
@@ -109,55 +106,30 @@ class RunDirectories:
         with suppress(OSError):  # most runs have no older recordings
             older = sorted((directory / RECORDINGS).iterdir(), reverse=True)
             paths |= {path.name: path for path in older[:MAX_RECORDINGS] if OLDER.fullmatch(path.name)}
-        return {name: path for name, path in paths.items() if _is_regular(path)}
+        return {name: path for name, path in paths.items() if path.is_file() and not path.is_symlink()}
 
 
-def file_response(request: Request, path: Path, media_type: str, *, etag: str | None = None, cache: str) -> Response:
+def file_response(
+    request: Request, path: Path, media_type: str, *, etag: str | None = None, cache: str = "no-cache"
+) -> Response:
     """Answer with the file, the requested range of it, or 304.
 
-    Starlette does all of it but two things that RFC 9110 wants (section 14): a Range that is malformed, or in another
-    unit, is ignored instead of refused; and 416 is a problem, as every other error is.
-
-    If-None-Match, If-Modified-Since, Range, and If-Range with an entity tag count. ``etag`` has no quotation marks and
-    is made from time and size if None; ``cache`` is the header Cache-Control.
+    If-None-Match, If-Modified-Since, Range and If-Range count. ``etag`` has no quotation marks and is made from time
+    and size if None; ``cache`` is the header Cache-Control.
 
     Raises:
-        ProblemError: 416, the range lies beyond the file.
+        ProblemError: 416, the range lies beyond the file; 404, it cannot be read.
     """
     headers = {"cache-control": cache, **({"etag": f'"{etag}"'} if etag else {})}
     try:
-        file = open_regular(path)
+        status = path.stat()
     except OSError as error:
         raise ProblemError(404, "no-such-file", f"{path.name} cannot be read: {error.strerror}") from None
-    response = _OpenFileResponse(file, headers=headers, media_type=media_type)
+    response = FileResponse(path, headers=headers, media_type=media_type, stat_result=status)
     if _CONDITIONS.is_not_modified(response.headers, request.headers):
         return NotModifiedResponse(response.headers)
-    _check_range(request, response)
+    begins = _RANGE.match(request.headers.get("range", ""))
+    if begins is not None and int(begins[1]) >= status.st_size and "if-range" not in request.headers:
+        beyond = {"Content-Range": f"bytes */{status.st_size}"}
+        raise ProblemError(416, "no-such-range", f"the file has {status.st_size} bytes", beyond)
     return response
-
-
-class _OpenFileResponse(FileResponse):
-    """Starlette's, of a file that is open: what lies at its path may be another one by now, or a link."""
-
-    def __init__(self, file: BinaryIO, **options: Any) -> None:
-        super().__init__(f"/proc/self/fd/{file.fileno()}", stat_result=os.fstat(file.fileno()), **options)
-        self._file = file  # open for as long as the response is there
-
-
-def _is_regular(path: Path) -> bool:
-    try:
-        return stat.S_ISREG(path.lstat().st_mode)
-    except OSError:
-        return False
-
-
-def _check_range(request: Request, response: FileResponse) -> None:
-    """Drop a Range that does not count, so that Starlette sends the whole file."""
-    size = int(response.headers["content-length"])
-    asked = _RANGE.fullmatch(request.headers.get("range", "").strip())
-    start, end = asked.groups() if asked else ("", "")
-    changed = request.headers.get("if-range", response.headers["etag"]).strip() != response.headers["etag"]
-    if changed or not (start or end) or (start and end and int(end) < int(start)):
-        request.scope["headers"] = [pair for pair in request.scope["headers"] if pair[0] != b"range"]
-    elif (start and int(start) >= size) or (not start and int(end) == 0):
-        raise ProblemError(416, "no-such-range", f"the file has {size} bytes", {"Content-Range": f"bytes */{size}"})

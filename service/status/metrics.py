@@ -24,7 +24,6 @@ from service.store.models import ACTIVE, CONDITIONS, ActorStatus, Record, RunRea
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 NUM_ENDED_RUNS = 5
 MAX_RUNS = 50
-MAX_NAMES = 100
 _STATES: tuple[RunState, ...] = get_args(RunState)
 _ACTOR_STATES: tuple[Literal["starting", "alive", "lost"], ...] = get_args(ActorStatus.model_fields["state"].annotation)
 _logger = logging.getLogger(__name__)
@@ -186,9 +185,9 @@ class Telemetry(Collector):
     def _about_registry(self) -> Iterator[_Family]:
         up, versions, aliases = _REGISTRY_UP.family(), _VERSIONS.family(), _ALIAS.family()
         try:
-            for name in self._registry.names()[:MAX_NAMES]:
+            for name in self._registry.names():
                 versions.add_metric([name], len(self._registry.versions(name)))
-                for alias, number in list(self._registry.aliases(name).items())[:MAX_NAMES]:
+                for alias, number in self._registry.aliases(name).items():
                     aliases.add_metric([name, alias], number)
         except (StorageError, OSError) as error:
             _logger.warning("/metrics has not all of the registry: %s", error)

@@ -1,34 +1,20 @@
-"""The OpenAPI document; errors and security, which all routes share, are added here so that no route can omit them."""
+"""What FastAPI's document of the API does not know by itself: errors and security, which routes share."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from fastapi import FastAPI, Security
+from fastapi.security import APIKeyCookie, HTTPBearer
+
 from service.registry.token import SESSION_COOKIE
-from service.status.auth import OPEN, PROBES, SESSION
 from service.status.problems import MEDIA_TYPE, Problem
 
-_CONTENT = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
-_COMMON = {
-    "400": "The request is malformed HTTP.",
-    "401": "A token is needed, or it is the wrong one.",
-    "413": "The body is too large.",
-    "421": "The host is not localhost.",
-    "500": "A file of the service is damaged, or the service failed.",
-}
-_SCHEMES = {
-    "bearer": {"type": "http", "scheme": "bearer", "description": "The token the service was started with."},
-    "session": {
-        "type": "apiKey",
-        "in": "cookie",
-        "name": SESSION_COOKIE,
-        "description": "Set by POST /v1/session, for browsers; GET only.",
-    },
-}
 DESCRIPTION = """
 Runs, their progress, and primitives. Errors are `application/problem+json` (RFC 9457).
 On a public address every request but `/livez` needs the token; on any address those that change something need it.
 """
+_CONTENT = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
 
 
 def problems(*texts: tuple[int, str]) -> dict[int | str, dict[str, Any]]:
@@ -36,33 +22,40 @@ def problems(*texts: tuple[int, str]) -> dict[int | str, dict[str, Any]]:
     return {status: {"description": text, "content": _CONTENT} for status, text in texts}
 
 
+COMMON = problems(
+    (400, "The request is malformed HTTP."),
+    (401, "A token is needed, or it is the wrong one."),
+    (413, "The body is too large."),
+    (421, "The host is not localhost."),
+    (500, "A file of the service is damaged, or the service failed."),
+)
+"""Errors of every route."""
 UNKNOWN_RUN = (404, "There is no such run.")
 UNAVAILABLE = (503, "The runs cannot be read at the moment.")
 INVALID = (422, "The request does not match this document.")
 READ_ONLY = (403, "This service has no token and so changes nothing.")
+SECURITY = [
+    Security(HTTPBearer(description="The token the service was started with.", auto_error=False)),
+    Security(
+        APIKeyCookie(
+            name=SESSION_COOKIE, description="Set by POST /v1/session, for browsers; GET only.", auto_error=False
+        )
+    ),
+]
+"""Dependencies that only tell how to show the token; ``AuthMiddleware`` asks for it."""
 
 
-def complete(tree: dict[str, Any], *, public: bool) -> None:
-    """Add what all routes share to FastAPI's document; if ``public``, reading needs the token, too."""
-    tree["components"]["securitySchemes"] = _SCHEMES
-    problem = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
-    tree["components"]["schemas"] |= {"Problem": problem, **problem.pop("$defs")}
-    for path, methods in tree["paths"].items():
-        for method, operation in methods.items():
-            reading = method in ("get", "head")
-            for parameter in operation.get("parameters", ()):
-                schema = parameter["schema"]  # one that can be left out is X or null; a URL cannot hold null
-                schema |= schema.pop("anyOf", [{}])[0]
-            operation["security"] = _security(path, reading=reading, public=public)
-            for status, text in _COMMON.items():
-                operation["responses"].setdefault(status, {"description": text, "content": _CONTENT})
-            operation["responses"] = dict(sorted(operation["responses"].items()))
+class DocumentedApp(FastAPI):
+    """An app whose document has the schema of errors, and parameters that can be left out but are never null."""
 
-
-def _security(path: str, *, reading: bool, public: bool) -> list[dict[str, list[str]]]:
-    if path in OPEN or path == SESSION:
-        return []
-    if not reading:
-        return [{"bearer": []}]
-    schemes: list[dict[str, list[str]]] = [{"bearer": []}, {"session": []}]
-    return schemes if public and path not in PROBES else [{}, *schemes]
+    def openapi(self) -> dict[str, Any]:
+        """The OpenAPI document."""
+        tree = super().openapi()
+        problem = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+        tree["components"]["schemas"] |= {"Problem": problem, **problem.pop("$defs")}
+        for parameter in (
+            each for path in tree["paths"].values() for each in path.get("get", {}).get("parameters", ())
+        ):
+            schema = parameter["schema"]
+            schema |= schema.pop("anyOf", [{}])[0]
+        return tree

@@ -12,11 +12,11 @@ from service.base.errors import ConfigError
 from service.base.files import open_regular
 from service.base.parsing import ParseError, parse_json
 from service.config.tree import read_yaml
-from service.status.schemas import GoalFrame, GoalFrames, LogEntry, RunCommand, RunLog, RunSetup
+from service.status.schemas import GoalFrame, GoalFrames, RunCommand, RunLog, RunSetup
 from service.store.disk_reader import is_study
 from service.store.models import ACTIVE, OUTPUT_FILE, GoalGrid, RunStatus
 from service.store.run_history import read_history
-from service.store.run_log import read_log
+from service.store.run_log import LogLine, read_log
 
 DEFAULT_CELL_M = 0.05
 FRAME_BYTES = 256 * 1024
@@ -63,14 +63,13 @@ def log(directory: Path | None, limit: int) -> RunLog:
     """Read what happened to a run: what its process said, and the changes between its processes."""
     if directory is None:
         return RunLog(entries=(), num_entries=0)
-    entries = [LogEntry(at=each.at, level=each.level, text=each.text) for each in read_log(directory)]
+    entries = read_log(directory)
     history = read_history(directory)
     for event in history.events if history is not None else ():
         said = [f"{name} was {before!r} and is {now!r}" for name, (before, now) in event.changed.items()]
         said += [f"lost and left out: {text}" for text in event.damaged_records]
-        entries.append(
-            LogEntry(at=event.at, level="info", text=f"from iteration {event.after_iteration}: {'; '.join(said)}")
-        )
+        text = f"from iteration {event.after_iteration}: {'; '.join(said)}"
+        entries.append(LogLine(at=event.at, level="info", text=text))
     entries.sort(key=lambda entry: entry.at)
     return RunLog(
         entries=tuple(entries[-limit:]), num_entries=len(entries), output=tuple(_output(directory / OUTPUT_FILE))

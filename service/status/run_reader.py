@@ -14,6 +14,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from datetime import timedelta
 from pathlib import Path
 from typing import TypeVar
@@ -89,7 +90,8 @@ class CombinedReader:
         """Ask a run to end after its current iteration; nothing happens if it has ended."""
         self.run(run_id)  # or raise UnknownRunError
         self._ask_redis(lambda: self._redis.request_stop(run_id))
-        _if_known(lambda: self._disk.request_stop(run_id))
+        with suppress(UnknownRunError):  # of a run on another machine
+            self._disk.request_stop(run_id)
 
     def ready(self) -> None:
         """Return if the directories can be read; Redis is not needed."""
@@ -122,8 +124,10 @@ class CombinedReader:
         failure = self._failure
         if failure is not None and self._clock() - failure[0] < RETRY_AFTER_S:
             return None
+        answer = None
         try:
-            answer = _if_known(question)
+            with suppress(UnknownRunError):
+                answer = question()
         except StoreUnavailableError as error:
             if failure is None:
                 _logger.warning("%s; what is in run directories is shown all the same", error)
@@ -133,10 +137,3 @@ class CombinedReader:
             _logger.warning("Redis is back")
         self._failure = None
         return answer
-
-
-def _if_known(question: Callable[[], _Answer]) -> _Answer | None:
-    try:
-        return question()
-    except UnknownRunError:
-        return None

@@ -9,6 +9,7 @@ from pydantic import AwareDatetime, Field, JsonValue
 from service.config.frozen import FrozenModel
 from service.registry.manifest import Manifest
 from service.store.models import RunStatus
+from service.store.run_log import LogLine
 
 Axis = Literal["env_steps", "iteration", "wall_s"]
 """What a curve is drawn over: env steps, iterations, or seconds of learning."""
@@ -16,16 +17,10 @@ Origin = Literal["registry", "bundled"]
 """Whether primitives are in this service's registry, or came with its package."""
 
 
-class Alive(FrozenModel):
-    """Answer of a service that runs."""
+class ServiceState(FrozenModel):
+    """That the service runs, that it can read runs and registry, or that a browser has its session."""
 
-    status: Literal["alive"] = "alive"
-
-
-class Ready(FrozenModel):
-    """Answer of a service that can read the runs and the registry."""
-
-    status: Literal["ready"] = "ready"
+    status: Literal["alive", "ready", "open"]
 
 
 class RunList(FrozenModel):
@@ -140,18 +135,10 @@ class TaskTable(FrozenModel):
     problems: tuple[str, ...] = Field(description="why runs are left out")
 
 
-class LogEntry(FrozenModel):
-    """Something that happened to a run."""
-
-    at: AwareDatetime
-    level: Literal["info", "warning", "error"]
-    text: str
-
-
 class RunLog(FrozenModel):
     """What happened to a run, oldest first."""
 
-    entries: tuple[LogEntry, ...] = Field(description="the newest that were asked for")
+    entries: tuple[LogLine, ...] = Field(description="the newest that were asked for")
     num_entries: int = Field(ge=0, description="in all")
     output: tuple[str, ...] = Field((), description="last lines that a study's run wrote to its terminal")
 
@@ -172,12 +159,6 @@ class GoalFrames(FrozenModel):
 
     cell_size_m: float = Field(gt=0)
     frames: tuple[GoalFrame, ...]
-
-
-class Session(FrozenModel):
-    """A browser's session."""
-
-    status: Literal["open"]
 
 
 class TokenEntry(FrozenModel):

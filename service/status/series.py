@@ -85,7 +85,7 @@ def _one(
     runs: RunReader, run_id: str, names: Sequence[str], axis: Axis, start: float | None, end: float | None, points: int
 ) -> dict[str, Any]:
     try:
-        found = runs.columns(run_id, _with_axis(names, axis))
+        found = runs.columns(run_id, list(dict.fromkeys([*names, _WALL])) if axis == "wall_s" else names)
     except StoreError as error:
         nothing: dict[str, Any] = {"last_iteration": 0, "num_iterations": 0, "x": [], "curves": {}, "names": []}
         return {"run_id": run_id, **nothing, "problem": str(error)}
@@ -140,10 +140,6 @@ def axis_of(found: Columns, axis: Axis) -> _Floats:
     if values is None:
         return np.zeros(len(found.iteration))
     return np.maximum.accumulate(np.nan_to_num(values))
-
-
-def _with_axis(names: Sequence[str], axis: Axis) -> list[str]:
-    return list(dict.fromkeys([*names, *([_WALL] if axis == "wall_s" else [])]))
 
 
 def _last(found: Columns) -> int:

@@ -8,7 +8,6 @@ import signal
 import socket
 import threading
 import time
-from contextlib import ExitStack
 from pathlib import Path
 
 import uvicorn
@@ -17,7 +16,7 @@ from service.base.errors import StatusError
 from service.registry.registry import Registry
 from service.status.app import create_app
 from service.status.auth import is_loopback
-from service.status.ports import DEFAULT_PORT
+from service.status.ports import DEFAULT_PORT, listen
 from service.store.models import RunReader
 
 START_TIMEOUT_S = 10.0
@@ -50,7 +49,7 @@ class StatusServer:
         port: int = DEFAULT_PORT,
         runs_dir: Path | None = None,
     ) -> None:
-        self._socket = _bind(host, port)
+        self._socket = _listen(host, port)
         address, self.port = self._socket.getsockname()[:2]
         try:
             # public or not depends on the bound address, not on the name of the host
@@ -93,7 +92,7 @@ class StatusServer:
 
     def stop(self) -> None:
         """Finish open requests, end event streams, and free the port."""
-        self.app.streams.close()  # or the server would wait for their clients
+        self.app.state.streams.close()  # or the server would wait for their clients
         self._server.should_exit = True
         if self._thread.is_alive():
             self._thread.join(STOP_TIMEOUT_S)
@@ -132,25 +131,14 @@ class StatusServer:
             _logger.exception("the status service at port %d ended", self.port)
 
 
-def _bind(host: str, port: int) -> socket.socket:
+def _listen(host: str, port: int) -> socket.socket:
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        family, kind, protocol, _, address = found[0]
-        with ExitStack() as on_error:
-            bound = on_error.enter_context(socket.socket(family, kind, protocol))
-            bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a restart need not wait for old connections
-            bound.bind(address)
-            bound.listen()
-            on_error.pop_all()
-        return bound
-    except (OSError, OverflowError, UnicodeError) as error:
-        match getattr(error, "errno", None):
-            case errno.EADDRINUSE:
-                reason = f"port {port} of {host} is taken; stop what listens there, or choose another with --port"
-            case errno.EACCES:
-                reason = f"port {port} of {host}: {error}; choose one above 1023 with --port"
-            case _:
-                reason = f"cannot listen at {host!r} port {port}: {error}; --host is a name or address of this machine"
+        return listen(host, port)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            reason = f"port {port} of {host} is taken; stop what listens there, or choose another with --port"
+        else:
+            reason = f"cannot listen at {host!r} port {port}: {error}; name an address of this machine with --host"
         raise StatusError(reason) from None
 
 

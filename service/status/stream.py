@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-import weakref
-from collections.abc import AsyncIterator, Callable, Collection
+from collections.abc import AsyncIterator, Collection
+from contextlib import asynccontextmanager
 
 from anyio import to_thread
 from fastapi.sse import ServerSentEvent
@@ -43,8 +43,6 @@ class RunFollower:
         self._status: RunStatus | None = None
         self._unavailable = False
         self.ended = False
-        self.release: Callable[[], object] = lambda: None
-        """Gives its place among the open streams back, if it has not yet."""
 
     def poll(self) -> list[ServerSentEvent]:
         """Read the run and return the new events; store errors become events."""
@@ -95,8 +93,11 @@ class Streams:
         """End all streams, within ``POLL_S``."""
         self._closed = True
 
-    async def follow(self, run_id: str, names: Collection[str] | None, after_iteration: int | None) -> RunFollower:
-        """Begin to follow a run after the last iteration that the client has; None to begin with the newest record.
+    @asynccontextmanager
+    async def follow(
+        self, run_id: str, names: Collection[str] | None, after_iteration: int | None
+    ) -> AsyncIterator[RunFollower]:
+        """Follow a run after the last iteration that the client has; None to begin with the newest record.
 
         Raises:
             UnknownRunError: there is no such run.
@@ -110,26 +111,17 @@ class Streams:
         self.num_open += 1  # before anything is waited for, or many could pass at once
         try:
             run = await to_thread.run_sync(self._runs.run, run_id)
-        except BaseException:
+            yield RunFollower(self._runs, run, names, after_iteration)
+        finally:
             self.num_open -= 1
-            raise
-        follower = RunFollower(self._runs, run, names, after_iteration)
-        follower.release = weakref.finalize(follower, self._release)  # also where its stream never begins
-        return follower
 
     async def events(self, follower: RunFollower) -> AsyncIterator[ServerSentEvent]:
         """Yield events until the run ends, the stream is too old, or the service stops."""
         end_s = time.monotonic() + MAX_AGE_S
-        try:
-            yield ServerSentEvent(retry=_RETRY_MS)
-            while not self._closed:
-                for event in await to_thread.run_sync(follower.poll):
-                    yield event
-                if follower.ended or time.monotonic() >= end_s:
-                    return
-                await asyncio.sleep(POLL_S)
-        finally:
-            follower.release()
-
-    def _release(self) -> None:
-        self.num_open -= 1
+        yield ServerSentEvent(retry=_RETRY_MS)
+        while not self._closed:
+            for event in await to_thread.run_sync(follower.poll):
+                yield event
+            if follower.ended or time.monotonic() >= end_s:
+                return
+            await asyncio.sleep(POLL_S)

@@ -18,9 +18,9 @@ from service.methods import task_evaluation
 from service.methods.task import TaskLearning
 from service.methods.task_methods import METHODS
 from service.registry.bundled import BUNDLED
+from service.registry.loading import network_problems
 from service.registry.publishing import publish
 from service.registry.registry import Registry
-from service.registry.verification import network_problems
 from service.robot.running import for_robot
 from service.runs.resuming import resumed_config
 from service.runs.train import train

@@ -75,7 +75,7 @@ def test_what_is_nowhere(registry: Registry, publish: Publish) -> None:
     with pytest.raises(UnknownVersionError) as error:
         find_version("panda-cube@best", registry.root)
     assert f"no alias 'best' in the registry {BUNDLED}" in str(error.value)
-    assert f"the registry {registry.root} has no panda-cube" in str(error.value)
+    assert f"no 'panda-cube' in the registry {registry.root}" in str(error.value)
     with pytest.raises(UnknownVersionError, match="no alias 'best'"):
         find_version("panda-cube@best", BUNDLED)
     publish()

@@ -1,5 +1,6 @@
 """Services on loopback, each with the same two runs and a registry of two versions."""
 
+import shutil
 from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
@@ -24,18 +25,24 @@ def slow_tests(monkeypatch: pytest.MonkeyPatch) -> None:
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The directory of ``runs`` and ``registry``."""
     home = tmp_path_factory.mktemp("status")
+    write_home(home)
+    return home
+
+
+def write_home(home: Path) -> None:
+    """Write two runs and a registry of two versions, in place of what is there."""
+    shutil.rmtree(home)
     write_runs(home / "runs")
     registry = Registry(home / "registry")
     publish(registry, value=1.0)
     publish(registry, value=2.0)
     registry.set_alias("tiny", "champion", 1)
-    return home
 
 
-def serve(home: Path, *, token: str | None = TOKEN, host: str = "127.0.0.1") -> StatusServer:
+def serve(home: Path, *, token: str | None = TOKEN, host: str = "127.0.0.1", port: int = 0) -> StatusServer:
     """Make a service of the runs and the registry in ``home``; it is not started."""
     runs = home / "runs"
-    return StatusServer(DiskReader(runs), Registry(home / "registry"), token=token, host=host, port=0, runs_dir=runs)
+    return StatusServer(DiskReader(runs), Registry(home / "registry"), token=token, host=host, port=port, runs_dir=runs)
 
 
 @pytest.fixture(scope="module")

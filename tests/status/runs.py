@@ -16,8 +16,8 @@ from service.store.models import ActorStatus, GoalCell, GoalGrid, RunStatus
 
 TOKEN = "5f1d3c0a9b7e4826d1c0b5a4938271605f4e3d2c1b0a9988"
 WRONG = "0000000000000000000000000000000000000000000000ff"
-CLIENT: dict[str, Any] = {"trust_env": False, "timeout": 300.0}
-"""Options of an HTTP client that asks this machine alone, and waits where it is busy."""
+CLIENT: dict[str, Any] = {"trust_env": False, "timeout": 300.0, "verify": False}
+"""Options of an HTTP client that asks this machine alone, without TLS, and waits where it is busy."""
 VIDEO = bytes(range(256)) * 40
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
 

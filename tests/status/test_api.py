@@ -9,8 +9,8 @@ import pytest
 from service.registry.bundled import BUNDLED
 from service.registry.manifest import parse_manifest
 from service.registry.registry import Registry
+from service.status.api_primitives import Shelf
 from service.status.server import StatusServer
-from service.status.shelf import Shelf
 from service.store.disk_reader import DiskReader
 from service.store.models import GoalGrid, RunStatus
 from tests.status.conftest import serve
@@ -28,15 +28,13 @@ def test_runs_newest_start_first(client):
     assert answer["num_runs"] == 2
 
 
-@pytest.mark.parametrize(("query", "ids", "num_runs"), [("active=true", ["cube"], 1), ("active=false", ["old"], 1)])
+@pytest.mark.parametrize(
+    ("query", "ids", "num_runs"),
+    [("active=true", ["cube"], 1), ("active=false", ["old"], 1), ("limit=1", ["cube"], 2)],
+)
 def test_active_and_ended_runs(client, query, ids, num_runs):
     answer = client.get(f"/v1/runs?{query}").json()
     assert ([run["run_id"] for run in answer["runs"]], answer["num_runs"]) == (ids, num_runs)
-
-
-def test_a_limited_list_has_the_total_number(client):
-    answer = client.get("/v1/runs?limit=1").json()
-    assert ([run["run_id"] for run in answer["runs"]], answer["num_runs"]) == (["cube"], 2)
 
 
 def test_a_run(client, home):
@@ -68,9 +66,10 @@ def test_goals(client):
     assert GoalGrid.model_validate_json(client.get("/v1/runs/cube/goals").content) == grid()
 
 
-def test_no_goals_yet(client):
-    answer = client.get("/v1/runs/old/goals")
-    assert (answer.status_code, answer.json()["type"]) == (404, "urn:tandem:no-goals-yet")
+@pytest.mark.parametrize(("path", "kind"), [("old/goals", "no-goals-yet"), ("cube/video", "no-such-file")])
+def test_what_a_run_does_not_have(client, path, kind):
+    answer = client.get(f"/v1/runs/{path}")
+    assert (answer.status_code, answer.json()["type"]) == (404, f"urn:tandem:{kind}")
 
 
 def test_files(client):
@@ -79,18 +78,6 @@ def test_files(client):
     for file in files:
         answer = client.get(file["url"])
         assert (answer.headers["content-type"], len(answer.content)) == (file["media_type"], file["num_bytes"])
-
-
-def test_a_run_without_pictures(client):
-    assert client.get("/v1/runs/cube/files").json() == {"files": []}
-    assert client.get("/v1/runs/cube/video").json()["type"] == "urn:tandem:no-such-file"
-
-
-def test_the_video_of_skills(client, home):
-    path = home / "runs" / "cube" / "skills.mp4"
-    path.write_bytes(b"skills")
-    assert client.get("/v1/runs/cube/video").content == b"skills"
-    path.unlink()  # other tests share these runs
 
 
 @pytest.mark.parametrize("name", ["status.json", "metrics.jsonl", "..%2Fcube%2Fgoals.json", "%2Fetc%2Fpasswd"])

@@ -1,15 +1,10 @@
 """Primitives over HTTP, from real services, correct and faulty ones."""
 
-import asyncio
-import gzip
-import itertools
 import os
-import socket
 import subprocess
 import sys
 import threading
-import time
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -20,20 +15,19 @@ import service
 from service.base.errors import (
     DamagedBlobError,
     FetchError,
-    RegistryError,
     StatusError,
     StorageError,
     TandemError,
     UnknownVersionError,
     WrongTokenError,
 )
-from service.registry import client
 from service.registry.bundled import BUNDLED
 from service.registry.client import fetch_primitives
 from service.registry.registry import Registry
 from service.status.server import StatusServer
 from service.store.disk_reader import DiskReader
 from tests.registry.helpers import files_in
+from tests.runs.runs import assert_one_line
 from tests.status.conftest import serve
 from tests.status.runs import TOKEN, WRONG, publish
 
@@ -103,13 +97,7 @@ def blob_path(answers):
     return next(path for path in answers if "blobs" in path)
 
 
-def assert_one_line(error, *parts):
-    assert "\n" not in str(error)
-    for part in parts:
-        assert str(part) in str(error)
-
-
-@pytest.mark.parametrize(("reference", "number"), [("tiny", 2), ("tiny@champion", 1), ("tiny@2", 2)])
+@pytest.mark.parametrize(("reference", "number"), [("tiny", 2), ("tiny@champion", 1)])
 def test_a_fetched_version_is_complete(server, home, tmp_path, reference, number):
     registry, version = fetch_primitives(server.url, reference, cache_dir=tmp_path)
     assert version == ("tiny", number)
@@ -144,32 +132,14 @@ def test_two_services_have_two_caches(published, tmp_path):
     assert registries[0].root != registries[1].root
 
 
-@pytest.mark.parametrize("change", ["flipped", "short", "long", "empty"])
-def test_a_corrupted_blob_is_refused_and_nothing_is_kept(published, tmp_path, change):
+@pytest.mark.parametrize("length", [-1, 0])
+def test_a_corrupted_blob_is_refused_and_nothing_is_kept(published, tmp_path, length):
     path = blob_path(published)
     status, kind, blob = published[path]
-    bad = {
-        "flipped": blob[:-1] + bytes([blob[-1] ^ 1]),
-        "short": blob[:-1],
-        "long": blob + b"x" * 100_000,
-        "empty": b"",
-    }
-    published[path] = (status, kind, bad[change])
+    published[path] = (status, kind, blob[:length])
     with answering(published) as url, pytest.raises(DamagedBlobError) as error:
         fetch_primitives(url, "tiny@1", cache_dir=tmp_path / "cache")
     assert_one_line(error.value, url.removeprefix("http://"))
-    assert files_in(tmp_path / "cache") == {}
-
-
-def test_a_blob_that_is_damaged_at_the_service(tmp_path):
-    registry = Registry(tmp_path / "registry")
-    publish(registry)
-    (blob,) = (registry.root / "blobs" / "sha256").iterdir()
-    blob.write_bytes(b"x" * blob.stat().st_size)
-    (tmp_path / "runs").mkdir()
-    with serve(tmp_path) as server, pytest.raises(DamagedBlobError) as error:
-        fetch_primitives(server.url, "tiny", cache_dir=tmp_path / "cache")
-    assert_one_line(error.value, f"{server.url} says: ", "is damaged: expected sha256")
     assert files_in(tmp_path / "cache") == {}
 
 
@@ -184,10 +154,11 @@ def test_a_manifest_that_was_changed_in_transit(published, tmp_path):
 def test_the_manifest_of_another_version(published, tmp_path):
     published["/v1/primitives/other/versions/1"] = published["/v1/primitives/tiny/versions/1"]
     published["/v1/primitives/tiny/versions/7"] = published["/v1/primitives/tiny/versions/1"]
-    for reference in ("other@1", "tiny@7"):
-        with answering(published) as url, pytest.raises(DamagedBlobError) as error:
-            fetch_primitives(url, reference, cache_dir=tmp_path / "cache")
-        assert_one_line(error.value, "gave the manifest of tiny@1", f"for {reference}")
+    with answering(published) as url:
+        for reference in ("other@1", "tiny@7"):
+            with pytest.raises(DamagedBlobError) as error:
+                fetch_primitives(url, reference, cache_dir=tmp_path / "cache")
+            assert_one_line(error.value, "gave the manifest of tiny@1", f"for {reference}")
 
 
 @pytest.mark.parametrize(
@@ -204,79 +175,24 @@ def test_unknown_versions(server, tmp_path, reference, parts):
     assert_one_line(error.value, server.url, *parts)
 
 
-def test_invalid_references(server, tmp_path):
-    with pytest.raises(RegistryError, match=r"^bad reference 'Tiny!'"):
-        fetch_primitives(server.url, "Tiny!", cache_dir=tmp_path)
-
-
 def test_the_token(home, tmp_path, monkeypatch):
     with serve(home, host="0.0.0.0") as server:
         with pytest.raises(WrongTokenError) as error:
             fetch_primitives(server.url, "tiny", cache_dir=tmp_path)
-        assert_one_line(error.value, server.url, "wants a token", "TANDEM_TOKEN")
+        assert_one_line(error.value, server.url, "a token is needed", "TANDEM_TOKEN")
         with pytest.raises(WrongTokenError) as error:
             fetch_primitives(server.url, "tiny", token=WRONG, cache_dir=tmp_path)
-        assert_one_line(error.value, "wants another token")
+        assert_one_line(error.value, "wrong token")
         assert WRONG not in str(error.value)
         assert fetch_primitives(server.url, "tiny", token=TOKEN, cache_dir=tmp_path)[1].number == 2
         monkeypatch.setenv("TANDEM_TOKEN", TOKEN)
         for variable in ("TANDEM_URL", "TANDEM_REGISTRY"):
             with pytest.raises(WrongTokenError) as error:  # it may be anybody's URL
                 fetch_primitives(server.url, "tiny", cache_dir=tmp_path)
-            assert_one_line(error.value, "wants a token", "TANDEM_URL to this URL")
+            assert_one_line(error.value, "a token is needed", "TANDEM_URL to this URL")
             with monkeypatch.context() as configured:
                 configured.setenv(variable, f"{server.url}/")
                 assert fetch_primitives(server.url, "tiny", cache_dir=tmp_path)[1].number == 2
-
-
-@contextmanager
-def dripping(pieces, pause_s):
-    """Run a server that sends these bytes to whoever connects, with pauses; yield its URL and what it was asked."""
-    asked = []
-    with socket.create_server(("127.0.0.1", 0)) as server:
-
-        def answer():
-            with suppress(OSError):
-                connection, _ = server.accept()
-                with connection:
-                    asked.append(connection.recv(65536))
-                    for piece in pieces:
-                        connection.sendall(piece)
-                        time.sleep(pause_s)
-
-        threading.Thread(target=answer, daemon=True).start()
-        yield f"http://127.0.0.1:{server.getsockname()[1]}", asked
-
-
-@pytest.mark.parametrize(
-    "begin", [b"HTTP/1.1 200 OK\r\ncontent-length: 9999\r\n\r\n", b"HTTP/1.1 200 OK\r\nx: "], ids=["body", "head"]
-)
-def test_a_service_that_drips_is_given_up(tmp_path, monkeypatch, begin):
-    monkeypatch.setattr(client, "DEADLINE_S", 1.0)
-    pieces = itertools.chain([begin], itertools.repeat(b"a"))
-    with dripping(pieces, 0.05) as (url, _), pytest.raises(FetchError, match="does not answer in time"):
-        fetch_primitives(url, "tiny", cache_dir=tmp_path)
-
-
-def test_nothing_is_unpacked_and_no_word_of_the_service_is_believed(tmp_path, monkeypatch):
-    """A few kilobytes that would unpack to a gigabyte, and an answer without end."""
-    monkeypatch.setattr(client, "MAX_MANIFEST_BYTES", 100_000)
-    packed = gzip.compress(bytes(10_000_000))
-    head = b"HTTP/1.1 200 OK\r\ncontent-encoding: gzip\r\ncontent-length: %d\r\n\r\n" % len(packed)
-    with dripping([head + packed], 0.0) as (url, asked), pytest.raises(DamagedBlobError, match="not JSON"):
-        fetch_primitives(url, "tiny", cache_dir=tmp_path)
-    assert b"accept-encoding: identity" in asked[0].lower()
-    endless = itertools.chain([b"HTTP/1.1 200 OK\r\nconnection: close\r\n\r\n"], itertools.repeat(bytes(10_000)))
-    with dripping(endless, 0.0) as (url, _), pytest.raises(DamagedBlobError, match="more than 100000 bytes"):
-        fetch_primitives(url, "tiny", cache_dir=tmp_path)
-
-
-def test_an_event_loop_may_run_already(home, tmp_path):
-    async def fetch():
-        return fetch_primitives(server.url, "tiny", cache_dir=tmp_path)[1].number
-
-    with serve(home) as server:
-        assert asyncio.run(fetch()) == 2
 
 
 def test_no_service_at_the_url(home, tmp_path):
@@ -294,14 +210,9 @@ def test_no_service_at_the_url(home, tmp_path):
         ((200, "text/html", b"<h1>a router</h1>"), "not JSON"),
         ((404, "text/html", b"<h1>a router</h1>"), "404 and text/html"),
         ((302, "text/html", b""), "302"),
-        ((500, "application/problem+json", b"{"), "500"),
-        ((503, "application/problem+json", b'{"detail": "the store\\nis away"}'), "the store is away"),
-        ((503, "application/problem+json", b'{"detail": "\\u001b]0;owned\\u0007"}'), r"\x1b]0;owned\x07"),
-        ((503, "application/problem+json", b"[" * 60_000), "503"),
+        ((503, "application/problem+json", b'{"type": "x", "detail": "the store\\nis away"}'), "the store is away"),
         ((503, "text/\x1b[2J", b""), "503"),
-        ((200, "application/json", b"[" * 60_000), "nested more than 64 deep"),
         ((200, "application/json", b"[]"), "not a JSON object"),
-        ((500, "text/plain", b"x" * 200_000), "too long"),
     ],
 )
 def test_something_else_at_the_url(tmp_path, answer, part):
@@ -311,9 +222,7 @@ def test_something_else_at_the_url(tmp_path, answer, part):
     assert str(error.value).isprintable()
 
 
-@pytest.mark.parametrize(
-    "url", ["http://", "http://me:secret@host:1", "ftp://host", "http://host:port", "http://h/?q=1"]
-)
+@pytest.mark.parametrize("url", ["http://", "http://me:secret@host:1", "ftp://host", "http://host:port"])
 def test_invalid_urls(tmp_path, url):
     with pytest.raises(StatusError) as error:
         fetch_primitives(url, "tiny", cache_dir=tmp_path)
@@ -356,8 +265,3 @@ def test_load_primitives_imports_neither_torch_nor_the_service(champions, tmp_pa
     )
     assert result.returncode == 0, result.stderr
     assert result.stdout.startswith("panda-cube@")
-
-
-def test_load_primitives_asks_a_service_alone(server):
-    with pytest.raises(UnknownVersionError, match=r"no 'panda-nobody'"):
-        service.load_primitives("panda-nobody@champion", registry=server.url)

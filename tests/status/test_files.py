@@ -29,19 +29,11 @@ def test_a_range(client, asked, start, end):
     assert answer.headers["content-range"] == f"bytes {start}-{end - 1}/{len(VIDEO)}"
 
 
-@pytest.mark.parametrize("asked", [f"bytes={len(VIDEO)}-", f"bytes={10**17}-{10**17}", "bytes=-0"])
+@pytest.mark.parametrize("asked", [f"bytes={len(VIDEO)}-", f"bytes={10**17}-{10**17}"])
 def test_a_range_beyond_the_file(client, asked):
     answer = client.get(URL, headers={"Range": asked})
     assert (answer.status_code, answer.json()["type"]) == (416, "urn:tandem:no-such-range")
     assert answer.headers["content-range"] == f"bytes */{len(VIDEO)}"
-
-
-@pytest.mark.parametrize(
-    "asked", ["bytes=-", "bytes=9-1", "lines=0-1", "bytes=a-b", "bytes=0-1,4-5", "", "bytes=0x1-2"]
-)
-def test_a_malformed_range_gives_the_whole_file(client, asked):
-    answer = client.get(URL, headers={"Range": asked})
-    assert (answer.status_code, answer.content) == (200, VIDEO)
 
 
 def test_pictures_of_a_studys_run(tmp_path):
@@ -63,12 +55,6 @@ def test_not_changed(client):
         answer = client.get(URL, headers={"If-None-Match": given})
         assert (answer.status_code, answer.content, answer.headers["etag"]) == (304, b"", tag)
     assert client.get(URL, headers={"If-None-Match": '"other"'}).content == VIDEO
-
-
-def test_not_modified_since(client):
-    modified = client.get(URL).headers["last-modified"]
-    assert client.get(URL, headers={"If-Modified-Since": modified}).status_code == 304
-    assert client.get(URL, headers={"If-Modified-Since": "Thu, 01 Jan 1970 00:00:00 GMT"}).content == VIDEO
 
 
 def test_a_conditional_request_for_a_range(client):

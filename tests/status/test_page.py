@@ -3,24 +3,22 @@
 import logging
 import re
 import shutil
+from types import SimpleNamespace
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
 
 from service.registry.registry import Registry
-from service.status.server import StatusServer
-from service.store.disk_reader import DiskReader
 from service.store.models import ActorStatus
 from service.store.run_log import logging_to
 from tests.status.browser import CHROMIUM, Visit, chromium
-from tests.status.conftest import serve
+from tests.status.conftest import serve, write_home
 from tests.status.runs import TOKEN, VIDEO, WRONG, append, grid, publish, record, write_runs, write_status, write_trial
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on PATH; on Debian: apt-get install chromium")
 
 NBSP = "\u00a0"
-PHONE = {"viewport": {"width": 360, "height": 740}, "has_touch": True, "is_mobile": True}
 HOSTILE = "<img src=x onerror=alert(1)><script>alert(2)</script>"
 LUMINANCE = """colour => {
   const channels = colour.match(/[0-9.]+/g).slice(0, 3).map(c => c / 255)
@@ -30,40 +28,43 @@ LUMINANCE = """colour => {
 
 
 @pytest.fixture(scope="module")
-def browser():
+def shared(tmp_path_factory):
+    """One service and one page of it for all tests: the page's libraries take a browser seconds."""
+    home = tmp_path_factory.mktemp("page")
+    write_home(home)
     with chromium() as browser:
-        yield browser
+        shared = SimpleNamespace(browser=browser, home=home, server=serve(home))
+        shared.server.start()
+        shared.visit = Visit(browser, shared.server.url)
+        yield shared
+        shared.server.stop()
 
 
 @pytest.fixture
-def visit(browser, server):
-    """A visit to the shared service, which no test changes."""
-    visit = Visit(browser, server.url)
-    yield visit
-    visit.context.close()
+def visit(shared):
+    """The page, at no view; what its service has is new for each test."""
+    write_home(shared.home)
+    shared.visit.complaints.clear()
+    shared.visit.asked.clear()
+    yield shared.visit
+    shared.visit.go("#/no/view").page.get_by_text("There is no page at this address.").wait_for()
 
 
 @pytest.fixture
-def own(browser, tmp_path):
-    """A service for one test, which may change everything: (visit, home, server)."""
-    write_runs(tmp_path / "runs")
-    publish(Registry(tmp_path / "registry"), "panda-cube")
-    with serve(tmp_path) as server:
-        visit = Visit(browser, server.url)
-        yield visit, tmp_path, server
-        visit.context.close()
+def home(shared, visit):
+    return shared.home
+
+
+def complaints(visit):
+    """What the browser complained of, but for answers that are errors."""
+    return [said for said in visit.complaints if "Failed to load resource" not in said]
 
 
 # --- what it shows --------------------------------------------------------------------------------------------------
 
 
-def test_nothing_goes_wrong_and_nothing_leaves_the_service(own):
-    visit, _, server = own
-    for place, table in (
-        ("#/", "Runs"),
-        ("#/runs/cube", "Versions of panda-cube"),
-        ("#/primitives", "Versions of panda-cube"),
-    ):
+def test_nothing_goes_wrong_and_nothing_leaves_the_service(visit):
+    for place, table in (("#/", "Runs"), ("#/runs/cube", "Actors"), ("#/primitives", "Versions of tiny")):
         visit.go(place).page.get_by_role("table", name=table, exact=True).wait_for()
         if place == "#/runs/cube":
             visit.points("alice/valid_fraction", 3)
@@ -71,7 +72,7 @@ def test_nothing_goes_wrong_and_nothing_leaves_the_service(own):
             visit.wait("document.querySelector('.space').dataset.cells === '2'")
     assert visit.complaints == []
     assert len(visit.asked) > 10
-    assert [url for url in visit.asked if not url.startswith((f"{server.url}/", "about:blank"))] == []
+    assert [url for url in visit.asked if not url.startswith((f"{visit.url}/", "about:blank"))] == []
 
 
 def test_runs(visit):
@@ -96,10 +97,15 @@ def test_a_run(visit):
     assert tiles["Progress"].startswith(f"30.0{NBSP}%")
     assert f"about 14{NBSP}s to go" in tiles["Progress"]  # 7,000 env steps at 500 a second
     assert "6\n1 refused" in re.sub("\n+", "\n", tiles["Rollouts"])
+    rows = page.get_by_role("table", name="Actors").locator("tbody tr")
+    texts = [row.locator("td").all_inner_texts() for row in rows.all()]
+    assert [text[0] for text in texts] == ["rollout-1", "learner", "rollout-0"]  # the lost one first
+    assert texts[2][1:4] == ["alive", "2", "this machine"]
+    assert re.fullmatch(rf"\d+{NBSP}(s|min) ago", texts[2][4])
+    assert texts[2][7] == "killed"
 
 
-def test_downstream_trainings(own):
-    visit, home, _ = own
+def test_downstream_trainings(visit, home):
     for seed, success in enumerate((0.80, 0.82, 0.84)):
         write_trial(home / "runs", f"push-ours-{seed}", "push", "ours", seed, success)
     (write_trial(home / "runs", "wall", "wall", "scratch-mcp", 0, 0.5) / "episodes.mp4").write_bytes(VIDEO)
@@ -111,12 +117,10 @@ def test_downstream_trainings(own):
     assert scratch == f"scratch MCP no primitives wall \u2013 50.0{NBSP}% 44 to 56, 1 seed".split()
     page.get_by_role("link", name=f"82.0{NBSP}%").click()
     page.get_by_role("heading", name="3 runs compared").wait_for()
-    name = "push-ours-2"
-    assert visit.points("evaluation/success_last", 2, name)[-1] == (2000, 0.84)
+    assert visit.points("evaluation/success_last", 2, "push-ours-2")[-1] == (2000, 0.84)
     page.get_by_label("seeds as a band").check()
-    visit.wait(
-        "document.querySelectorAll('.canvas')[0].data.some(({name}) => name === 'push, ours, with tiny@1 highest')"
-    )
+    band = "push, ours, with tiny@1 highest"
+    visit.wait(f"document.querySelectorAll('.canvas')[0].data.some(({{name}}) => name === '{band}')")
     visit.go("#/runs/wall").page.get_by_text(f"tandem evaluate {home}/runs/wall").wait_for()
     assert f"50.0{NBSP}%" in page.locator(".tile").nth(1).inner_text()
     assert f"last step, 44 to 56{NBSP}%" in page.locator(".tile").nth(1).inner_text()
@@ -126,7 +130,7 @@ def test_downstream_trainings(own):
     assert versions.locator("tbody td").nth(2).inner_text() == "push"
     visit.go("#/").page.get_by_label("Show").select_option("downstream")
     visit.wait("document.querySelectorAll('tbody tr').length === 4")
-    assert [said for said in visit.complaints if "Failed to load resource" not in said] == []
+    assert complaints(visit) == []
 
 
 def test_the_goal_map(visit):
@@ -150,15 +154,10 @@ def test_the_goal_map(visit):
     assert page.locator("rect.cell").first.get_attribute("fill") == "rgb(253, 231, 37)"  # it has the most
 
 
-def test_the_keyboard_reads_the_goal_map(own):
-    visit, home, _ = own
-    cells = [
-        grid().cells[0].model_copy(update={"center_m": (x, 0.0, z)})
-        for x, z in ((-0.15, 0.02), (0.0, 0.02), (0.0, 0.27))
-    ]
-    (home / "runs" / "cube" / "goals.json").write_text(
-        grid().model_copy(update={"cells": tuple(cells)}).model_dump_json()
-    )
+def test_the_keyboard_reads_the_goal_map(visit, home):
+    places = ((-0.15, 0.02), (0.0, 0.02), (0.0, 0.27))
+    cells = tuple(grid().cells[0].model_copy(update={"center_m": (x, 0.0, z)}) for x, z in places)
+    (home / "runs" / "cube" / "goals.json").write_text(grid().model_copy(update={"cells": cells}).model_dump_json())
     page = visit.go("#/runs/cube").page
     page.locator("rect.cell").first.wait_for()
     reading, goal_map = page.locator(".reading"), page.get_by_role("application")
@@ -168,19 +167,7 @@ def test_the_keyboard_reads_the_goal_map(own):
     assert page.locator("rect.cell.chosen").count() == 1
 
 
-def test_actors(visit):
-    page = visit.go("#/runs/cube").page
-    rows = page.get_by_role("table", name="Actors").locator("tbody tr")
-    rows.first.wait_for()
-    texts = [row.locator("td").all_inner_texts() for row in rows.all()]
-    assert [text[0] for text in texts] == ["rollout-1", "learner", "rollout-0"]  # the lost one first
-    assert texts[2][1:4] == ["alive", "2", "this machine"]
-    assert re.fullmatch(rf"\d+{NBSP}(s|min) ago", texts[2][4])
-    assert texts[2][7] == "killed"
-
-
-def test_log_commands_and_configuration(own):
-    visit, home, _ = own
+def test_log_commands_and_configuration(visit, home):
     run = home / "runs" / "cube"
     (run / "config.yaml").write_text("name: panda-cube\nlearner: {bob: {target_kl: 0.03}}\n")
     with logging_to(run):
@@ -199,22 +186,19 @@ def test_versions(visit):
     page = visit.go("#/primitives").page
     rows = page.get_by_role("table", name="Versions of tiny").locator("tbody tr")
     rows.first.wait_for()
-    texts = [row.locator("td").all_inner_texts() for row in rows.all()]
-    assert [text[:3] for text in texts] == [
-        ["tiny@2", "latest", f"50.0{NBSP}%"],
-        ["tiny@1", "champion", f"50.0{NBSP}%"],
-    ]
+    texts = [row.locator("td").all_inner_texts()[:3] for row in rows.all()]
+    assert texts == [["tiny@2", "latest", f"50.0{NBSP}%"], ["tiny@1", "champion", f"50.0{NBSP}%"]]
     with page.expect_download() as download:
         rows.first.get_by_role("link", name="parameters of tiny@2").click()
     assert download.value.suggested_filename == "tiny-2.safetensors"
     assert visit.complaints == []
 
 
-def test_the_newest_video_plays_and_older_ones(own):
-    visit, home, _ = own
-    (home / "runs" / "old" / "recordings").mkdir()
-    (home / "runs" / "old" / "recordings" / "rounds-20260101T120000.mp4").write_bytes(VIDEO)
-    path = str(home / "runs" / "old" / "rounds.mp4")
+def test_the_newest_video_plays_and_older_ones(visit, home):
+    run = home / "runs" / "old"
+    (run / "recordings").mkdir()
+    (run / "recordings" / "rounds-20260101T120000.mp4").write_bytes(VIDEO)
+    path = str(run / "rounds.mp4")
     writer = imageio_ffmpeg.write_frames(path, (64, 32), fps=25, codec="libx264", macro_block_size=2)
     writer.send(None)
     for shade in range(0, 250, 10):
@@ -233,12 +217,10 @@ def test_the_newest_video_plays_and_older_ones(own):
 # --- how it goes on -------------------------------------------------------------------------------------------------
 
 
-def test_a_run_is_updated_live(own):
-    visit, home, _ = own
+def test_a_run_is_updated_live(visit, home):
     page = visit.go("#/runs/cube").page
     visit.points("alice/valid_fraction", 3)
     append(home / "runs", "cube", record(4, **{"alice/valid_fraction": 0.875}))
-    visit.points("alice/valid_fraction", 4)
     assert visit.points("alice/valid_fraction", 4)[3] == (4000, 0.875)
     write_status(home / "runs", "cube", state="failed", last_error="it broke", warnings=("no Redis",), iteration=4)
     page.get_by_text("it broke").wait_for()
@@ -247,8 +229,7 @@ def test_a_run_is_updated_live(own):
     assert visit.complaints == []
 
 
-def test_a_run_that_was_resumed_from_an_earlier_iteration(own):
-    visit, home, _ = own
+def test_a_run_that_was_resumed_from_an_earlier_iteration(visit, home):
     visit.go("#/runs/cube")
     visit.points("bob/success_rate", 3)
     metrics = home / "runs" / "cube" / "metrics.jsonl"
@@ -257,15 +238,12 @@ def test_a_run_that_was_resumed_from_an_earlier_iteration(own):
     replaced.replace(metrics)
     visit.points("bob/success_rate", 1)
     append(home / "runs", "cube", record(2, **{"bob/success_rate": 0.75}))
-    visit.points("bob/success_rate", 2)
     assert visit.points("bob/success_rate", 2)[1] == (2000, 0.75)
 
 
-def test_the_list_of_runs_is_updated_live(own):
-    visit, home, _ = own
+def test_the_list_of_runs_is_updated_live(visit, home):
     page = visit.go().page
-    link = page.get_by_role("link", name="cube", exact=True)
-    link.focus()
+    page.get_by_role("link", name="cube", exact=True).focus()
     write_status(home / "runs", "cube", num_env_steps=5000)
     write_status(home / "runs", "another")
     page.get_by_text("2 active runs, 3 runs in all.").wait_for()
@@ -273,25 +251,39 @@ def test_the_list_of_runs_is_updated_live(own):
     assert page.evaluate("document.activeElement.textContent") == "cube"  # a keyboard does not lose its place
 
 
-def test_the_service_goes_away_and_comes_back(own):
-    visit, home, server = own
+def restart(shared):
+    shared.server = serve(shared.home, port=shared.server.port)
+    shared.server.start()
+
+
+def test_the_service_goes_away_and_comes_back(visit, home, shared):
     page = visit.go("#/runs/cube").page
     visit.points("alice/valid_fraction", 3)
     banner = page.locator("#banner")
     assert banner.is_hidden()
-    server.stop()
+    shared.server.stop()
     page.get_by_text("No answer from the service since").wait_for()
     append(home / "runs", "cube", record(4))
     assert page.locator("figure.chart .canvas svg.main-svg").count() >= 6  # what was known stays to be seen
-    runs = home / "runs"
-    with StatusServer(DiskReader(runs), Registry(home / "registry"), port=server.port, runs_dir=runs):
-        visit.points("alice/valid_fraction", 4)
-        banner.wait_for(state="hidden")
+    restart(shared)
+    visit.points("alice/valid_fraction", 4)
+    banner.wait_for(state="hidden")
+
+
+def test_a_view_that_did_not_load_comes_when_the_service_is_back(shared):
+    visit = Visit(shared.browser, shared.server.url)
+    page = visit.go().page
+    page.get_by_role("table").first.wait_for()
+    shared.server.stop()
+    visit.go("#/tasks")
+    page.get_by_text("This view could not be loaded.").wait_for()
+    restart(shared)
+    page.get_by_role("heading", name="Tasks").wait_for()
+    visit.context.close()
 
 
 @pytest.mark.parametrize("place", ["#/", "#/runs/cube"])
-def test_the_runs_go_away_and_come_back(own, place):
-    visit, home, _ = own
+def test_the_runs_go_away_and_come_back(visit, home, place):
     page = visit.go(place).page
     page.get_by_role("table").first.wait_for()
     (home / "runs").rename(home / "elsewhere")
@@ -301,8 +293,7 @@ def test_the_runs_go_away_and_come_back(own, place):
     page.locator("#banner").wait_for(state="hidden")
 
 
-def test_a_run_is_deleted_while_it_is_looked_at(own):
-    visit, home, _ = own
+def test_a_run_is_deleted_while_it_is_looked_at(visit, home):
     page = visit.go("#/runs/cube").page
     visit.points("alice/valid_fraction", 3)
     shutil.rmtree(home / "runs" / "cube")
@@ -315,34 +306,19 @@ def test_a_run_is_deleted_while_it_is_looked_at(own):
 # --- where one is ---------------------------------------------------------------------------------------------------
 
 
-def test_a_view_that_did_not_load_comes_when_the_service_is_back(own):
-    visit, home, server = own
-    page = visit.go().page
-    page.get_by_role("link", name="cube", exact=True).wait_for()
-    server.stop()
-    visit.go("#/tasks")
-    page.get_by_text("This view could not be loaded.").wait_for()
-    with StatusServer(DiskReader(home / "runs"), Registry(home / "registry"), port=server.port, runs_dir=home / "runs"):
-        page.get_by_role("heading", name="Tasks").wait_for()
-
-
-def test_links_are_permanent(visit):
+def test_links_are_permanent_and_the_keyboard_skips_to_the_content(visit):
     page = visit.go().page
     page.get_by_role("link", name="old", exact=True).click()
     page.get_by_role("heading", name="old finished").wait_for()
     assert page.url == f"{visit.url}/#/runs/old"
     page.reload()
     page.get_by_role("heading", name="old finished").wait_for()
-    page.go_back()
-    page.get_by_role("heading", name="Runs").wait_for()
-
-
-def test_the_keyboard_skips_to_the_content(visit):
-    page = visit.go("#/runs/cube").page
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
     assert page.evaluate("document.activeElement.id") == "main"
-    assert page.url.endswith("#/runs/cube")
+    assert page.url.endswith("#/runs/old")
+    page.go_back()
+    page.get_by_role("heading", name="Runs").wait_for()
 
 
 def test_views_and_runs_that_do_not_exist(visit):
@@ -358,12 +334,11 @@ def test_views_and_runs_that_do_not_exist(visit):
         page.locator("main").get_by_text(sentence).wait_for()
         assert page.get_by_role("link", name="All runs").count() == 1
         assert page.locator("main img, main script").count() == 0
-    assert [said for said in visit.complaints if "Failed to load resource" not in said] == []
+    assert complaints(visit) == []
 
 
 def test_goals_of_a_run_that_had_none_when_it_was_opened(visit):
-    page = visit.go("#/primitives").page
-    there = page.evaluate(
+    there = visit.go("#/primitives").page.evaluate(
         """async () => {
             const { GoalSpace } = await import('/page/space.js')
             const space = new GoalSpace(new AbortController().signal)
@@ -378,26 +353,20 @@ def test_goals_of_a_run_that_had_none_when_it_was_opened(visit):
     assert there == [[True, False], [False, True]]
 
 
-def test_a_run_that_does_not_exist_yet(own):
-    visit, home, _ = own
-    page = visit.go("#/runs/soon").page
-    page.get_by_text("No run 'soon' in").wait_for()
+def test_nothing_yet(visit, home):
+    shutil.rmtree(home / "registry")
+    for run in (home / "runs").iterdir():
+        shutil.rmtree(run)
+    page = visit.go().page
+    page.get_by_text("tandem train --run-dir runs/cube").wait_for()
+    write_status(home / "runs", "first")
+    page.get_by_role("link", name="first").wait_for()
+    visit.go("#/primitives").page.get_by_text("comes with tandem").first.wait_for()
+    assert visit.complaints == []
+    visit.go("#/runs/soon").page.get_by_text("No run 'soon' in").wait_for()
     write_status(home / "runs", "soon", name="elsewhere", published="elsewhere@1")
     page.get_by_role("heading", name="soon running").wait_for()
     page.get_by_text("The registry of this service has no version of elsewhere.").wait_for()
-
-
-def test_nothing_yet(browser, tmp_path):
-    (tmp_path / "runs").mkdir()
-    with serve(tmp_path) as server:
-        visit = Visit(browser, server.url)
-        page = visit.go().page
-        page.get_by_text("tandem train --run-dir runs/cube").wait_for()
-        write_status(tmp_path / "runs", "first")
-        page.get_by_role("link", name="first").wait_for()
-        visit.go("#/primitives").page.get_by_text("comes with tandem").first.wait_for()
-        assert visit.complaints == []
-        visit.context.close()
 
 
 # --- for everybody, and nobody else ---------------------------------------------------------------------------------
@@ -406,92 +375,67 @@ def test_nothing_yet(browser, tmp_path):
 def make_hostile(home):
     """Put markup into every free text of a run."""
     long = f"{HOSTILE} {'x' * 300}"
-    actor = ActorStatus(**{**RUNNING, "name": HOSTILE, "node": long, "last_error": long})
-    write_status(
-        home / "runs",
-        "cube",
-        name=HOSTILE,
-        last_error=long,
-        warnings=(HOSTILE, long),
-        actors=(actor,),
-        published=HOSTILE,
-    )
+    known = {"incarnation": 0, "state": "alive", "heartbeat": "2026-01-01T00:00:00Z"}
+    actor = ActorStatus(**known, name=HOSTILE, node=long, last_error=long)
+    texts = {"name": HOSTILE, "last_error": long, "warnings": (HOSTILE, long), "published": HOSTILE}
+    write_status(home / "runs", "cube", actors=(actor,), **texts)
 
 
-RUNNING = {"incarnation": 0, "state": "alive", "heartbeat": "2026-01-01T00:00:00Z"}
-
-
-def test_no_text_is_markup(own):
-    visit, home, _ = own
+def test_no_text_is_markup(visit, home):
     make_hostile(home)
     for place, table in (("#/", "Runs"), ("#/runs/cube", "Actors")):
         page = visit.go(place).page
         page.get_by_role("table", name=table, exact=True).get_by_text(HOSTILE).first.wait_for()
         assert page.locator("main img, main script").count() == 0
-    assert [said for said in visit.complaints if "Failed to load resource" not in said] == []
+    assert complaints(visit) == []
     assert [url for url in visit.asked if url.endswith("/x")] == []
 
 
-def test_a_phone_need_not_scroll_sideways(own, browser):
-    _, home, server = own
+def test_a_phone_need_not_scroll_sideways(visit, home):
     make_hostile(home)
-    visit = Visit(browser, server.url, **PHONE)
+    page, usual = visit.page, visit.page.viewport_size
+    page.set_viewport_size({"width": 360, "height": 740})
     settings = "".join(f"setting_{number}: {number}\n" for number in range(100))
     (home / "runs" / "cube" / "config.yaml").write_text(settings)
     write_trial(home / "runs", "x" * 100, HOSTILE, "ours", 0, 0.5, primitives=f"{HOSTILE}@1")
-    for place, table in (
-        ("#/", "Runs"),
-        ("#/runs/cube", "Actors"),
-        ("#/tasks", "Tasks"),
-        ("#/primitives", "Versions of panda-cube"),
-    ):
-        page = visit.go(place).page
-        page.get_by_role("table", name=table, exact=True).wait_for()
+    for place, table in {"#/": "Runs", "#/runs/cube": "Actors", "#/tasks": "Tasks", "#/primitives": ""}.items():
+        visit.go(place).page.get_by_role("table", name=table or "Versions of tiny", exact=True).wait_for()
         if place == "#/runs/cube":
             visit.points("alice/valid_fraction", 3)
             page.locator("rect.cell").first.wait_for()
             page.locator(".settings dt").nth(99).wait_for()
-        assert (
-            page.evaluate("[document.documentElement.scrollWidth, document.body.scrollWidth, innerWidth]") == [360] * 3
-        )
+        widths = page.evaluate("[document.documentElement.scrollWidth, document.body.scrollWidth, innerWidth]")
+        assert widths == [360] * 3
         assert page.locator("td").first.evaluate("cell => getComputedStyle(cell).display") == "flex"
         inner = "[...document.querySelectorAll('.scroll, .settings')].every(one => one.scrollWidth <= one.clientWidth)"
         assert page.evaluate(inner), place
-    visit.context.close()
+    page.set_viewport_size(usual)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_light_and_dark(browser, server, scheme):
-    visit = Visit(browser, server.url, color_scheme=scheme)
-    page = visit.go("#/runs/cube").page
-    page.get_by_role("table", name="Actors").wait_for()
+def test_light_and_dark(visit, scheme):
+    page = visit.page
+    page.emulate_media(color_scheme=scheme)
+    visit.go("#/runs/cube").page.get_by_role("table", name="Actors").wait_for()
     visit.points("alice/valid_fraction", 3)
     luminance = page.evaluate(f"({LUMINANCE})(getComputedStyle(document.body).backgroundColor)")
     assert luminance > 0.8 if scheme == "light" else luminance < 0.05
     card = page.evaluate(f"({LUMINANCE})(getComputedStyle(document.querySelector('.card')).backgroundColor)")
+    styles = dict.fromkeys(("h1", ".summary", ".hint", "td", "td a"), "color") | {".xtick text": "fill"}
+    styles |= dict.fromkeys(("li.c0 .swatch", "li.c1 .swatch"), "backgroundColor")
     contrasts = {}
-    for what, style in {
-        "h1": "color",
-        ".summary": "color",
-        ".hint": "color",
-        "td": "color",
-        "td a": "color",
-        ".xtick text": "fill",
-        "li.c0 .swatch": "backgroundColor",
-        "li.c1 .swatch": "backgroundColor",
-    }.items():
+    for what, style in styles.items():
         script = f"({LUMINANCE})(getComputedStyle(document.querySelector('{what}')).{style})"
         low, high = sorted((card, page.evaluate(script) if page.locator(what).count() else 1 - round(card)))
         contrasts[what] = (high + 0.05) / (low + 0.05)
     # WCAG 2: 4.5 for text, 3 for what is drawn
     assert {what: x for what, x in contrasts.items() if x < (3.0 if "swatch" in what else 4.5)} == {}
-    visit.context.close()
 
 
-def test_a_public_service_asks_for_its_token(browser, tmp_path):
+def test_a_public_service_asks_for_its_token(shared, tmp_path):
     write_runs(tmp_path / "runs")
     with serve(tmp_path, host="0.0.0.0") as server:
-        visit = Visit(browser, server.url)
+        visit = Visit(shared.browser, server.url)
         page = visit.go("#/runs/cube").page
         page.get_by_label("Token").fill(WRONG)
         page.get_by_role("button", name="Log in").click()

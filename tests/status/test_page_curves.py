@@ -1,6 +1,7 @@
 """The curves of the page in a real browser: one run's, and those of several over one another."""
 
 import csv
+import shutil
 
 import pytest
 
@@ -13,12 +14,6 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on PATH; o
 
 NBSP = "\u00a0"
 LONG = 3000
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as browser:
-        yield browser
 
 
 @pytest.fixture(scope="module")
@@ -43,16 +38,17 @@ def home(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def server(home):
-    with serve(home) as server:
-        yield server
+def shared(home):
+    """One page for all tests: its libraries take a browser seconds."""
+    with chromium() as browser, serve(home) as server:
+        yield Visit(browser, server.url)
 
 
 @pytest.fixture
-def visit(browser, server):
-    visit = Visit(browser, server.url)
-    yield visit
-    visit.context.close()
+def visit(shared):
+    shared.complaints.clear()
+    yield shared
+    shared.go("#/no/view").page.get_by_text("There is no page at this address.").wait_for()
 
 
 def test_curves_and_what_is_read_from_them(visit):
@@ -157,15 +153,14 @@ def test_runs_are_found_sorted_and_compared(visit):
     assert visit.complaints == []
 
 
-def test_a_missing_value_is_a_gap_and_a_new_one_is_drawn(browser, tmp_path):
-    write_runs(tmp_path / "runs")
-    append(tmp_path / "runs", "cube", record(4, **{"bob/success_rate": None}), record(5))
-    with serve(tmp_path) as server:
-        visit = Visit(browser, server.url).go("#/runs/cube")
-        assert visit.points("bob/success_rate", 5)[3:] == [(4000, None), (5000, 0.625)]
-        (dot,) = visit.traces("bob/success_rate alone")  # which no line goes to
-        assert (dot["x"], dot["y"]) == ([5000], [0.625])
-        append(tmp_path / "runs", "cube", record(6))
-        assert visit.points("bob/success_rate", 6)[5] == (6000, 0.75)
-        assert visit.traces("bob/success_rate alone") == []
-        visit.context.close()
+def test_a_missing_value_is_a_gap_and_a_new_one_is_drawn(visit, home):
+    write_status(home / "runs", "gap")
+    append(home / "runs", "gap", *(record(i) for i in (1, 2, 3)), record(4, **{"bob/success_rate": None}), record(5))
+    visit.go("#/runs/gap")
+    assert visit.points("bob/success_rate", 5, "gap")[3:] == [(4000, None), (5000, 0.625)]
+    (dot,) = visit.traces("bob/success_rate alone", "gap")  # which no line goes to
+    assert (dot["x"], dot["y"]) == ([5000], [0.625])
+    append(home / "runs", "gap", record(6))
+    assert visit.points("bob/success_rate", 6, "gap")[5] == (6000, 0.75)
+    assert visit.traces("bob/success_rate alone", "gap") == []
+    shutil.rmtree(home / "runs" / "gap")  # other tests list the runs

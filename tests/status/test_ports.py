@@ -38,6 +38,8 @@ def test_the_next_free_port():
     assert free_port("127.0.0.1", port) == port
     assert free_port("127.0.0.1") > 1023
     assert free_port("::1") > 1023
+    with pytest.raises(OSError, match="no name of a host"):
+        free_port("127.0.0..1")
 
 
 def test_serve_takes_the_next_one_unless_told_which(tmp_path, monkeypatch, busy, caplog):

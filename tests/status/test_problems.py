@@ -36,14 +36,10 @@ def assert_problem(answer, status, kind, *parts):
         ("GET", "/nope", 404, "about:blank", ["'/nope'", "/openapi.json"]),
         ("GET", "/v1/runs/", 404, "about:blank", []),
         ("GET", "/page/nope.js", 404, "about:blank", []),
-        ("GET", "/page/../app.py", 404, "about:blank", []),
         ("GET", "/page/%2e%2e/app.py", 404, "about:blank", []),
-        ("GET", "/docs", 404, "about:blank", []),
         ("GET", "/v1/runs/nope", 404, "unknown-run", ["'nope'", "cube, old"]),
-        ("GET", "/v1/runs/nope/metrics", 404, "unknown-run", []),
         ("GET", "/v1/runs/nope/metrics/stream", 404, "unknown-run", []),
         ("GET", "/v1/runs/nope/goals", 404, "unknown-run", []),
-        ("GET", "/v1/runs/nope/files", 404, "unknown-run", []),
         ("GET", "/v1/runs/nope/video", 404, "unknown-run", []),
         ("POST", "/v1/runs/nope/stop", 404, "unknown-run", []),
         ("GET", "/v1/runs/-bad-", 422, "invalid-request", ["path.run_id"]),
@@ -58,7 +54,6 @@ def assert_problem(answer, status, kind, *parts):
         ("GET", "/v1/primitives/tiny/versions/best", 404, "unknown-version", ["'best'", "champion -> 1"]),
         ("GET", "/v1/primitives/Tiny", 422, "invalid-request", ["path.name", "'Tiny'"]),
         ("GET", f"/v1/blobs/sha256/{'0' * 64}", 404, "unknown-blob", ["0" * 64]),
-        ("GET", "/v1/blobs/sha256/../../x", 404, "about:blank", []),
         ("GET", "/v1/blobs/sha256/nope", 422, "invalid-request", ["path.digest"]),
         ("DELETE", "/v1/runs", 405, "about:blank", ["'DELETE'"]),
         ("GET", "/v1/runs/old/stop", 405, "about:blank", ["'GET'"]),
@@ -78,11 +73,8 @@ def test_problems(client, method, path, status, kind, parts):
         (b"", "body"),
         (b"{", "JSON"),
         (b"\xff\xfe", "body"),
-        (b"null", "body"),
-        (b"[]", "body"),
         (b"{}", "body.version"),
         (b'{"version": "one"}', "body.version"),
-        (b'{"version": 0}', "body.version"),
         (b'{"version": 1e400}', "body.version"),
         (b'{"version": 1, "more": 2}', "body.more"),
         (b"[" * 30_000, "body"),
@@ -94,11 +86,6 @@ def test_malformed_bodies(client, home, body, part):
     assert_problem(answer, answer.status_code, answer.json()["type"])
     assert part in answer.text or answer.status_code == 400
     assert Registry(home / "registry").aliases("tiny")["champion"] == 1
-
-
-def test_an_alias_for_a_version_there_is_not(client):
-    answer = client.put("/v1/primitives/tiny/aliases/champion", json={"version": 9})
-    assert_problem(answer, 404, "unknown-version", "9", "1 to 2")
 
 
 def test_bodies_may_not_be_long(client):
@@ -177,10 +164,3 @@ def test_an_unexpected_error_is_only_in_the_log(tmp_path, caplog):
     (logged,) = caplog.records
     assert logged.getMessage() == "GET /v1/runs failed"
     assert logged.exc_info is not None
-
-
-def test_no_web_sockets(server):
-    key = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAA\r\n"
-    with socket.create_connection(("127.0.0.1", server.port), timeout=300) as connection:
-        connection.sendall(f"GET /v1/runs/nope HTTP/1.1\r\nHost: localhost\r\n{key}\r\n".encode())
-        assert connection.recv(1000).startswith(b"HTTP/1.1 404")  # as if it had not asked for one

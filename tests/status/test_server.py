@@ -33,11 +33,6 @@ def test_port_0_gives_a_free_port(home):
         assert httpx.get(f"{server.url}/livez", **CLIENT).status_code == 200
 
 
-def test_every_address_is_reached_over_loopback(home):
-    with serve(home, host="0.0.0.0") as server:
-        assert server.url == f"http://127.0.0.1:{server.port}"
-
-
 @pytest.mark.skipif(not socket.has_ipv6, reason="this Python was built without IPv6")
 def test_ipv6(home):
     try:
@@ -59,13 +54,6 @@ def test_stopping_frees_the_port_and_ends_the_thread(home):
     with socket.socket() as again:
         again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         again.bind(("127.0.0.1", server.port))
-
-
-def test_stopping_before_starting(home):
-    server = serve(home)
-    server.stop()
-    with pytest.raises(OSError, match="refused"):
-        socket.create_connection(("127.0.0.1", server.port), timeout=5)
 
 
 def test_a_port_that_is_taken(home):
