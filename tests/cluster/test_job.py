@@ -88,8 +88,8 @@ def answers(url):
         return response.read()
 
 
-def test_a_study_of_tasks_is_stopped_and_goes_on(head, tmp_path):
-    """Two seeds of a task, as tasks of Ray that fetch their primitives over HTTP."""
+def test_a_study_of_tasks_is_killed_with_its_driver_and_stopped_and_goes_on(head, tmp_path):
+    """Two seeds of two tasks, as tasks of Ray that fetch their primitives over HTTP."""
     _, address = head
     run, _ = play(tmp_path / "run", tiny_config(total_env_steps=120))
     registry, (port,), path = Registry(tmp_path / "registry"), free_ports(1), tmp_path / "night"
@@ -97,30 +97,51 @@ def test_a_study_of_tasks_is_stopped_and_goes_on(head, tmp_path):
     serve = [sys.executable, "-m", "service", "serve", "--runs", str(tmp_path), "--port", str(port)]
     place = ["--runtime", "ray", "--address", address, "--status", "off", "--registry", f"http://127.0.0.1:{port}"]
     command = [sys.executable, "-m", "service", "train", "--run-dir", str(path), *place]
-    begin = [*command, *TINY_TASK, "push", "--seeds", "0,1", "--primitives", "tiny@latest", "--parallel", "2"]
-    names = ["seed-0", "seed-1"]
-
-    def start(*arguments):
-        return subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    begin = [*command, *TINY_TASK, "push,wall", "--seeds", "0,1", "--primitives", "tiny@latest", "--parallel", "2"]
 
     def steps_saved():
-        """The iterations of the newest checkpoints."""
-        stores = [CheckpointStore(path / name / "checkpoints", keep=1) for name in names]
+        """The iterations of the newest checkpoints of the first two runs."""
+        stores = [CheckpointStore(path / f"push-seed-{seed}" / "checkpoints", keep=1) for seed in (0, 1)]
         return [max(store.steps(), default=0) for store in stores]
+
+    def start(*arguments):
+        environment = os.environ | {"MUJOCO_GL": "off"}  # no films
+        return subprocess.Popen(
+            arguments, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+
+    def statuses():
+        files = [path / f"push-seed-{seed}" / "status.json" for seed in (0, 1)]
+        return [json.loads(file.read_text()) for file in files if file.exists()]
+
+    def wait_until_each_goes_on(process, epoch):
+        def goes_on():
+            known = statuses()
+            return len(known) == 2 and all(each["epoch"] == epoch and each["iteration"] >= 2 for each in known)
+
+        wait_for(lambda: process.poll() is not None or (goes_on() and min(steps_saved()) >= 2))
+        assert process.poll() is None, process.stdout.read()
 
     with start(*serve, "--registry", str(registry.root)) as server:
         try:
             wait_for(lambda: answers(f"http://127.0.0.1:{port}/v1/runs"))
             with start(*begin, "--set", "run.total_env_steps=1_000_000") as driver:
-                wait_for(lambda: driver.poll() is not None or min(steps_saved()) >= 1)
+                try:
+                    wait_until_each_goes_on(driver, 1)
+                finally:
+                    driver.kill()
+            with start(*command, "--resume", "--parallel", "2") as driver:
+                wait_until_each_goes_on(driver, 2)  # Ray ends the tasks of the first one, and with them their processes
                 driver.send_signal(signal.SIGTERM)
                 said = driver.communicate(timeout=PATIENCE_S)[0]
             assert driver.returncode == 128 + signal.SIGTERM, said
-            left = [json.loads((path / name / "status.json").read_text()) for name in names]
+            left = statuses()
             assert [status["state"] for status in left] == ["interrupted", "interrupted"], said
             assert [status["iteration"] for status in left] == steps_saved()  # nothing is lost
-            runs = json.loads(answers(f"http://127.0.0.1:{port}/v1/runs"))["runs"]
-            assert {status["study"] for status in runs} == {None, "night"}
+            assert {status["study"] for status in json.loads(answers(f"http://127.0.0.1:{port}/v1/runs"))["runs"]} == {
+                None,
+                "night",
+            }
             steps = max(status["num_env_steps"] for status in left) + 200
             last = subprocess.run(
                 [*command, "--resume", "--set", f"run.total_env_steps={steps}"],
@@ -135,9 +156,9 @@ def test_a_study_of_tasks_is_stopped_and_goes_on(head, tmp_path):
         rows = read_lines(path / name / "metrics.jsonl")
         assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
         config = RunDirectory(path / name).read_config()
-        assert (config.primitives, config.task) == ("tiny@1", "push")
+        assert (config.primitives, config.task) == ("tiny@1", each.settings["task"])
         assert each.result == RunDirectory(path / name).read_result()["evaluation"]
-    assert len((path / "results.csv").read_text().splitlines()) == 3
+    assert len((path / "results.csv").read_text().splitlines()) == 5
 
 
 def test_a_job_is_stopped_and_continued_and_publishes(head, tmp_path):

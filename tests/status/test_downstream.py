@@ -1,6 +1,9 @@
-"""Runs that learn a task: the table of tasks, the list, and the page of one."""
+"""Runs that learn a task: the table of tasks, the list, the page of one, and stopping and resuming one."""
 
 import os
+import shlex
+import subprocess
+import sys
 
 import httpx
 import pytest
@@ -11,6 +14,7 @@ from service.status.task_table import task_table
 from service.store.disk_reader import DiskReader
 from tests.status.conftest import serve
 from tests.status.runs import BEARER, CLIENT, VIDEO, publish, write_runs, write_trial
+from tests.store.stores import wait_until
 
 OTHERS = {"primitives": "other@2", "primitives_digest": "1" * 64}
 
@@ -148,3 +152,51 @@ def test_a_run_that_learns_a_task_is_a_run(root, ask):
     assert ask("downstream")["rows"][0]["cells"][0]["run_ids"] == ["push-ours-3"]
     with pytest.raises(httpx.HTTPStatusError, match="404"):
         ask("runs/push-ours-3/goals")
+
+
+TINY = ("sac.num_worlds=4", "sac.gradient_steps=1", "sac.batch_size=16", "sac.learning_starts=200")
+TINY += ("sac.hidden_sizes=[8]", "run.evaluation_interval=0", "run.num_threads=1", "run.total_env_steps=100000000")
+
+
+@pytest.fixture
+def train(tmp_path, default_signals):
+    """Start ``tandem train`` in a process of its own, which makes no film."""
+    processes = []
+
+    def _train(*words):
+        command = [sys.executable, "-m", "service", "train", *words, "--run-dir", tmp_path / "runs" / "wall"]
+        processes.append(subprocess.Popen(command, env={**os.environ, "MUJOCO_GL": "off"}))
+        return processes[-1]
+
+    yield _train
+    for process in processes:
+        process.kill()
+        process.wait()
+
+
+def test_one_is_stopped_over_rest_and_resumed_by_its_directory_alone(tmp_path, train):
+    """A real training and a real service: what happened to the run is in its log."""
+    (tmp_path / "runs").mkdir()
+    with serve(tmp_path) as server, httpx.Client(base_url=server.url, headers=BEARER, **CLIENT) as client:
+
+        def ask(path=""):
+            return client.get(f"/v1/runs/wall{path}").raise_for_status().json()
+
+        def stop_after(process, iteration):
+            """Stop it once it is so far, and give its status then."""
+            wait_until(lambda: client.get("/v1/runs/wall").is_success and ask()["iteration"] >= iteration)
+            assert client.post("/v1/runs/wall/stop").json()["stopping"]
+            assert process.wait(300) == 0
+            return ask()
+
+        stopped = stop_after(train("wall", "--method", "scratch-monolithic", *(f"--set={each}" for each in TINY)), 3)
+        assert (stopped["state"], stopped["trial"]["method"]) == ("interrupted", "scratch-monolithic")
+        resume = shlex.split(ask("/setup")["resume_command"])
+        assert resume[:5] == ["tandem", "train", "--resume", "--run-dir", str(tmp_path / "runs" / "wall")]
+        again = stop_after(train("--resume"), stopped["iteration"] + 2)
+        assert (again["state"], again["epoch"]) == ("interrupted", 2)
+        assert ask("/metrics")["iteration"] == list(range(1, again["iteration"] + 1))
+        said = [entry["text"] for entry in ask("/log")["entries"]]
+        assert f"resumed at iteration {stopped['iteration']}, {stopped['num_env_steps']} env steps" in said
+        (row,) = client.get("/v1/downstream").json()["rows"]
+        assert (row["primitives"], row["cells"][0]["unfinished"]) == (None, ["wall"])
