@@ -91,8 +91,8 @@ def run_control(config: Config, name: str, runs: Path, trial_steps: int = TRIAL_
     if resume and resumed_config(directory, []) != config:
         raise TandemError(f"{directory.path} holds a run of another configuration; remove it")
     done = train(config, directory, directory.path, resume=resume, publish=False, on_iteration=_show)
-    if done.result.reason == "interrupted":  # what it learned so far is no result
-        raise TandemError(f"stopped at {done.result.num_env_steps:,} env steps; the same command goes on from there")
+    if done.reason == "interrupted":  # what it learned so far is no result
+        raise TandemError(f"stopped at {done.num_env_steps:,} env steps; the same command goes on from there")
     found = {}
     for task in TASKS:
         settings = [f"run.total_env_steps={trial_steps}", f"run.final_episodes={NUM_EPISODES}"]

@@ -210,19 +210,14 @@ def coverage(
         raise TandemError(f"--out {out}: the picture is a PNG; name a file that ends in .png")
     reference, _ = what_is_meant(reference, primitives)
     with loading():
-        from service.actors.coverage import RandomPolicy, skill_paths, skill_trajectories, visited_share
+        from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
+        from service.media.artifacts import paths_of
         from service.media.plots import plot_coverage
         from service.registry.loading import load
 
         trained = load(reference, registry).expect("primitives", "skills", by="tandem coverage")
     world = trained.world
-    if trained.kind == "primitives":
-        of, path = (
-            "composition",
-            skill_trajectories(trained.primitives, world, num_skills=skills, num_steps=steps, seed=seed),
-        )
-    else:
-        of, path = "skill", skill_paths(trained.skills, world, num_skills=skills, num_steps=steps, seed=seed)
+    path, of = paths_of(trained, skills, steps, seed)
     random = skill_trajectories(RandomPolicy(), world, num_skills=skills, num_steps=steps, seed=seed)
     paths = {trained.label: path, "random policy": random}
     shares = {name: visited_share(path, world.workspace) for name, path in paths.items()}
@@ -252,41 +247,16 @@ def render(
     """Make a film of a run's Alice beside its Bob, of a policy on goals or on its task, or of random skills."""
     reference, primitives = what_is_meant(reference, primitives)
     with loading():
-        from service.config.self_play import SelfPlayConfig
-        from service.config.skills import SkillDiscoveryConfig
-        from service.media import recording, video
+        from service.media.artifacts import film
         from service.methods.task_evaluation import FINAL_SEED
         from service.registry.loading import load
 
         options = film_options(size, camera, speed, out)
         trained = load(reference, registry, primitives).on(task)
-    config = trained.config
-    if trained.kind == "skills" and trained.task is None:
-        assert isinstance(config, SkillDiscoveryConfig)
-        if goals is not None:
-            raise TandemError(f"--goals: {trained.label} holds skills, of which random ones are shown; leave it out")
-        recorded = recording.record_skills(
-            trained.skills, config.world, num_skills=episodes, num_steps=config.skills.episode_steps, seed=seed
-        )
-        video.write_episode_video(recorded, config.world, out, options)
-    elif trained.alice is not None and isinstance(config, SelfPlayConfig) and goals is None:
-        rounds = recording.record_rounds(config, trained.alice, trained.policy, num_rounds=episodes, seed=seed)
-        video.write_video(rounds, config.world, out, options)
-    else:
-        trained.expect_goals("tandem render")
-        asked = parse_goals(goals or ("mixed" if trained.task is None else trained.goals), trained.world)
-        points = None if isinstance(asked, str) else asked
-        recorded = recording.record_episodes(
-            trained.policy,
-            trained.world,
-            asked if isinstance(asked, str) else "mixed",
-            num_episodes=episodes if points is None else len(points),
-            num_steps=trained.num_steps,
-            success_distance_m=trained.success_distance_m,
-            seed=seed if trained.task is None else seed + FINAL_SEED,
-            goal=points,
-        )
-        video.write_episode_video(recorded, trained.world, out, options)
+    if trained.kind == "skills" and trained.task is None and goals is not None:
+        raise TandemError(f"--goals: {trained.label} holds skills, of which random ones are shown; leave it out")
+    asked = None if goals is None else parse_goals(goals, trained.world)
+    film(trained, out, episodes, seed if trained.task is None else seed + FINAL_SEED, options, asked)
     typer.echo(f"video: {out}")
 
 

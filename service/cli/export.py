@@ -100,20 +100,10 @@ def dataset(
         if video is not None:
             write_video(rounds[:_MAX_FILMED], config.world, video, options)
     else:
-        asked = parse_goals(goals or ("mixed" if trained.task is None else trained.goals), config.world)
-        points = None if isinstance(asked, str) else asked
-        if points is not None:
-            points = points[[index % len(points) for index in range(episodes)]]
-        recorded = recording.record_episodes(
-            trained.policy,
-            config.world,
-            asked if isinstance(asked, str) else "mixed",
-            num_episodes=episodes,
-            num_steps=trained.num_steps,
-            success_distance_m=trained.success_distance_m,
-            seed=seed,
-            goal=points,
-        )
+        asked = None if goals is None else parse_goals(goals, config.world)
+        if asked is not None and not isinstance(asked, str):
+            asked = asked[[index % len(asked) for index in range(episodes)]]
+        recorded = recording.record_on_goals(trained, episodes, seed, asked)
         played = played_episodes(recorded)
         if video is not None:
             write_episode_video(recorded.first(_MAX_FILMED), config.world, video, options)

@@ -57,9 +57,8 @@ def run(
     """Bring the object to goals; Ctrl-C stops the robot first."""
     from service.robot.backends import read_backend
     from service.robot.calibrate import read_calibration
-    from service.robot.log import RobotLog
     from service.robot.loop import Bridge
-    from service.robot.running import parse_goal, play
+    from service.robot.running import RobotLog, parse_goal, play
 
     config, described, player = _bridge_config(overrides), read_backend(robot), _load(policy, registry)
     goal_m = None if goal is None else parse_goal(goal, player.world)
@@ -85,7 +84,14 @@ def run(
             player.policy, backend.robot, backend.poses, player.world, config,
             gain=gain, held=held, dry_run=dry_run, record=record,
         )  # fmt: skip
-        written = None if log is None else RobotLog(log, _header(player, described, config, calibration), player.world)
+        header = {
+            "policy": player.label,
+            "success_distance_m": player.success_distance_m,
+            "robot": described.model_dump(mode="json"),
+            "bridge": config.model_dump(mode="json"),
+            "calibration": None if calibration is None else str(calibration),
+        }
+        written = None if log is None else RobotLog(log, header, player.world)
         outcomes = []
         for outcome in play(
             bridge, backend, player, goal_m=goal_m, num_episodes=episodes, num_steps=steps, seed=seed, ready=ready
@@ -133,18 +139,18 @@ def replay(
 ) -> None:
     """Make a video of a log: effector and object where they were measured, in the scene of training."""
     from service.media.video import write_episode_video
-    from service.robot.log import read_log, states_of
+    from service.robot.running import read_log
 
-    logged = read_log(log)
-    write_episode_video(states_of(logged), logged.world, out)
+    world, recorded = read_log(log)
+    write_episode_video(recorded, world, out)
     typer.echo(f"video: {out}")
 
 
 def _bridge_config(overrides: list[str] | None) -> BridgeConfig:
     from pydantic import ValidationError
 
+    from service.config.frozen import first_error
     from service.config.tree import apply_override
-    from service.robot.backends import first_error
     from service.robot.loop import BridgeConfig
 
     tree: dict[str, Any] = {}
@@ -193,18 +199,6 @@ def _connected(
                 sys.stdin.readline()
 
         yield backend, key or always_held, wait
-
-
-def _header(
-    player: Trained, described: BackendConfig, config: BridgeConfig, calibration: Path | None
-) -> dict[str, Any]:
-    return {
-        "policy": player.label,
-        "success_distance_m": player.success_distance_m,
-        "robot": described.model_dump(mode="json"),
-        "bridge": config.model_dump(mode="json"),
-        "calibration": None if calibration is None else str(calibration),
-    }
 
 
 def _print_step(row: dict[str, Any], box: Box, *, to_stderr: bool) -> None:

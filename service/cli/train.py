@@ -249,7 +249,7 @@ def demo(
     rates = {where: done.metrics.get(f"evaluation/{name}_success_last") for name, where in _WHERE.items()}
     told = [f"{rate:.0%} of random goals {where}" for where, rate in rates.items() if rate is not None]
     reaches = f", and now reaches {' and '.join(told)}" if told else ""
-    typer.echo(f"\nBob has practised for {done.result.num_env_steps:,} steps{reaches}.")
+    typer.echo(f"\nBob has practised for {done.num_env_steps:,} steps{reaches}.")
     typer.echo(f"\nThat was a beginning. Primitives that have learned for longer come with tandem; {CHAMPION}:")
     evaluate(CHAMPION, registry=str(BUNDLED))  # prints what the first of the next commands prints
     commands = [
@@ -308,14 +308,13 @@ def _train(
             )  # fmt: skip
             if done.metrics:
                 final = {name.replace("evaluation/", "final/", 1): value for name, value in done.metrics.items()}
-                tracked.log({"env_steps": done.result.num_env_steps, **final})
+                tracked.log({"env_steps": done.num_env_steps, **final})
     except InterruptError as interrupt:
         raise stopped("stopped at once", interrupt.number, hint, begun=directory.exists) from None
-    result = done.result
-    typer.echo(f"\n{result.reason} after {result.num_env_steps:,} env steps, {result.iteration} iterations")
+    typer.echo(f"\n{done.reason} after {done.num_env_steps:,} env steps, {done.iteration} iterations")
     typer.echo(done.timing)
     if done.signal is not None:
-        rest = "" if result.reason == "interrupted" else ", but not evaluated, published and drawn to the end"
+        rest = "" if done.reason == "interrupted" else ", but not evaluated, published and drawn to the end"
         raise stopped(f"saved{rest}", done.signal, hint)
     for name, value in done.metrics.items():
         is_share = "success" in name or name == "coverage"

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
 
-if TYPE_CHECKING:
-    from pydantic_core import ErrorDetails
-
+NO_KEYS = BUILT_IN, DESCRIBED, NAMED = "built-in", "described", "named"
+"""Tags of what a key may hold; pydantic's locations have them between the keys."""
 _NUMBERS = (int, float, int | None, float | None)
 
 
@@ -26,6 +25,11 @@ class FrozenModel(BaseModel):
         return value
 
 
-def reason(error: ErrorDetails) -> str:
-    """What is wrong, in words, without pydantic's prefix of what our own checks say."""
-    return error["msg"].removeprefix("Value error, ")
+def first_error(error: ValidationError) -> str:
+    """The first thing that is wrong with plain values, in a few words."""
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"] if part not in NO_KEYS) or "the top level"
+    if first["type"] == "extra_forbidden":
+        return f"unknown key {key!r}"
+    found = "" if isinstance(first["input"], dict) else f" = {first['input']!r}"  # a whole group says nothing
+    return f"{key}{found}: {first['msg'].removeprefix('Value error, ')}"  # which our own checks have

@@ -11,10 +11,9 @@ from pydantic import BaseModel, ValidationError
 
 from service.base.errors import ConfigError, did_you_mean
 from service.config.find import METHODS, exact_name, find_class
-from service.config.frozen import reason
+from service.config.frozen import NO_KEYS, first_error
 from service.config.run import Config
 from service.config.tree import apply_override, read_yaml
-from service.config.world import NO_KEYS
 
 DEFAULT_METHOD = "self-play"
 """The method of a configuration that names none."""
@@ -61,16 +60,13 @@ def parse_config(tree: dict[str, Any], *, where: str) -> Config:
         return kind.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"] if part not in NO_KEYS) or "the top level"
-        found = "" if isinstance(first["input"], dict) else f" = {first['input']!r}"  # a whole group says nothing
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         if first["type"] == "extra_forbidden":
             *groups, name = (part for part in first["loc"] if isinstance(part, str) and part not in NO_KEYS)
             prefix, keys = "".join(f"{group}." for group in groups), list(_keys(kind))
             known = sorted(name for before, name in keys if before == prefix)
-            hint = _elsewhere(keys, name) or did_you_mean(name, known)
-            raise ConfigError(f"{where}: unknown key {key!r}; known there: {', '.join(known)}{more}{hint}") from None
-        raise ConfigError(f"{where}: {key}{found}: {reason(first)}{more}") from None
+            more = f"; known there: {', '.join(known)}{more}{_elsewhere(keys, name) or did_you_mean(name, known)}"
+        raise ConfigError(f"{where}: {first_error(error)}{more}") from None
 
 
 def changed_config(config: Config, overrides: Sequence[str]) -> Config:

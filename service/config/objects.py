@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
-from service.config.frozen import FrozenModel
+from service.config.frozen import DESCRIBED, NAMED, FrozenModel
 from service.config.model_files import LEAST_M, MeshConfig, Vector
 
 Shape = Literal["box", "sphere", "cylinder", "capsule", "ellipsoid", "mesh"]
@@ -109,10 +109,9 @@ def _read_mesh(value: Any) -> Any:
     return {**value, "mesh": read, "size_m": extent_m}
 
 
-_NAMED, _DESCRIBED = "named", "described"
 Object = Annotated[
-    Annotated[Literal["cube", "sphere"], Tag(_NAMED)] | Annotated[ObjectConfig, Tag(_DESCRIBED)],
-    Discriminator(lambda value: _NAMED if isinstance(value, str) else _DESCRIBED),
+    Annotated[Literal["cube", "sphere"], Tag(NAMED)] | Annotated[ObjectConfig, Tag(DESCRIBED)],
+    Discriminator(lambda value: NAMED if isinstance(value, str) else DESCRIBED),
     BeforeValidator(_read_mesh),
 ]
 """A name, or a description."""

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from service.base.errors import ConfigError
-from service.config.frozen import FrozenModel, reason
+from service.config.frozen import FrozenModel, first_error
 from service.config.model_files import Vector, absolute, digest_of
 from service.config.tree import read_yaml
 
@@ -147,9 +147,7 @@ def read_robot(path: Path) -> RobotConfig:
     try:
         robot = RobotConfig.model_validate(read_yaml(path))
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        raise ConfigError(f"robot {path}: {key}: {reason(first)}") from None
+        raise ConfigError(f"robot {path}: {first_error(error)}") from None
     if robot.model is None:
         raise ConfigError(f"robot {path}: model is missing: name an MJCF or URDF file")
     found = {**_found(robot.model, path.parent), "hand": robot.hand}

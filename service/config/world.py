@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
-from service.config.frozen import FrozenModel
+from service.config.frozen import BUILT_IN, DESCRIBED, FrozenModel
 from service.config.objects import Fixture, Object, ObjectConfig, Obstacle, simple_object
 from service.config.recipes import find_file, robots
 from service.config.robot import RobotConfig, read_robot
@@ -117,12 +117,9 @@ def _read_robot(value: Any) -> Any:
     return read_robot(find_file(value, robots())) if isinstance(value, str) and value != "panda" else value
 
 
-_BUILT_IN, _DESCRIBED = "built-in", "described"
-NO_KEYS = (_BUILT_IN, _DESCRIBED, "named")
-"""Parts of pydantic's locations that are no keys."""
 Robot = Annotated[
-    Annotated[Literal["panda"], Tag(_BUILT_IN)] | Annotated[RobotConfig, Tag(_DESCRIBED)],
-    Discriminator(lambda value: _BUILT_IN if isinstance(value, str) else _DESCRIBED),
+    Annotated[Literal["panda"], Tag(BUILT_IN)] | Annotated[RobotConfig, Tag(DESCRIBED)],
+    Discriminator(lambda value: BUILT_IN if isinstance(value, str) else DESCRIBED),
     BeforeValidator(_read_robot),
 ]
 

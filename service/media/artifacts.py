@@ -1,4 +1,4 @@
-"""The pictures and the video of a run, made from its directory alone."""
+"""The pictures and the video of a run, made from its directory alone; and what commands draw of anything trained."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from pathlib import Path
 from service.actors.coverage import NUM_SKILLS, skill_paths, skill_trajectories
 from service.base.errors import TandemError
 from service.base.progress import counted
+from service.base.types import StateArray
 from service.config.self_play import SelfPlayConfig
 from service.config.skills import SkillDiscoveryConfig
+from service.envs.sampling import GoalKind
 from service.media import recording, video
 from service.media.plots import plot_coverage, plot_curves, plot_goals
 from service.policies.numpy_policy import NumpyMCPPolicy
@@ -20,7 +22,7 @@ from service.store.run_directory import RunDirectory
 
 COVERAGE_STEPS = 100
 NUM_RECORDED_ROUNDS = 4
-NUM_RECORDED_SKILLS = 6
+NUM_RECORDED_EPISODES = 6
 _SEED = 7
 _logger = logging.getLogger(__name__)
 
@@ -37,16 +39,11 @@ def make_artifacts(directory: RunDirectory, registry: Path | str = "registry") -
         return {}
     trained = load(str(directory.path), registry)
     makers: dict[str, Callable[[], Path]] = {"curves": partial(plot_curves, directory.path, config.method)}
-    if trained.kind == "orchestrator":
-        makers["video"] = partial(_draw_episodes, directory, trained)
-    elif trained.kind == "skills":
-        makers["coverage"] = partial(_draw_skills, directory, trained)
-        makers["video"] = partial(_draw_skill_video, directory, trained)
-    else:
+    if trained.kind == "primitives":
         makers["goals"] = partial(plot_goals, directory.path, config.world.workspace)
-        if isinstance(trained.policy, NumpyMCPPolicy):
-            makers["coverage"] = partial(_draw_coverage, directory, trained)
-        makers["video"] = partial(_draw_rounds if trained.alice else _draw_episodes, directory, trained)
+    if trained.kind == "skills" or (trained.kind == "primitives" and isinstance(trained.policy, NumpyMCPPolicy)):
+        makers["coverage"] = partial(_draw_coverage, directory, trained)
+    makers["video"] = partial(_draw_video, directory, trained)
     files = {}
     for name, make in counted(makers.items(), "drawing", len(makers), "pictures"):
         try:
@@ -56,51 +53,62 @@ def make_artifacts(directory: RunDirectory, registry: Path | str = "registry") -
     return files
 
 
-def _draw_rounds(directory: RunDirectory, trained: Trained) -> Path:
-    assert trained.alice is not None
-    assert isinstance(trained.config, SelfPlayConfig)
-    rounds = recording.record_rounds(
-        trained.config, trained.alice, trained.policy, num_rounds=NUM_RECORDED_ROUNDS, seed=_SEED
-    )
-    path = directory.path / "rounds.mp4"
-    directory.keep_recording(path)
-    return video.write_video(rounds, trained.config.world, path)
-
-
-def _draw_skills(directory: RunDirectory, trained: Trained) -> Path:
-    config = trained.config
-    assert isinstance(config, SkillDiscoveryConfig)
-    steps = config.skills.episode_steps
-    paths = skill_paths(trained.skills, config.world, num_skills=NUM_SKILLS, num_steps=steps, seed=_SEED)
-    return plot_coverage(paths, config.world.workspace, directory.path / "coverage.png", config.name, of="skill")
-
-
-def _draw_skill_video(directory: RunDirectory, trained: Trained) -> Path:
-    config = trained.config
-    assert isinstance(config, SkillDiscoveryConfig)
-    steps = config.skills.episode_steps
-    episodes = recording.record_skills(
-        trained.skills, config.world, num_skills=NUM_RECORDED_SKILLS, num_steps=steps, seed=_SEED
-    )
-    path = directory.path / "skills.mp4"
-    directory.keep_recording(path)
-    return video.write_episode_video(episodes, config.world, path)
-
-
-def _draw_episodes(directory: RunDirectory, trained: Trained) -> Path:
-    episodes = recording.record_episodes(
-        trained.player(),
-        trained.world,
-        trained.goals,
-        num_episodes=NUM_RECORDED_SKILLS,
-        num_steps=trained.num_steps,
-        success_distance_m=trained.success_distance_m,
-        seed=_SEED,
-    )
-    return video.write_episode_video(episodes, trained.world, directory.path / "episodes.mp4")
-
-
 def _draw_coverage(directory: RunDirectory, trained: Trained) -> Path:
-    world = trained.config.world
-    paths = skill_trajectories(trained.primitives, world, num_skills=NUM_SKILLS, num_steps=COVERAGE_STEPS, seed=_SEED)
-    return plot_coverage(paths, world.workspace, directory.path / "coverage.png", trained.config.name)
+    config = trained.config
+    steps = config.skills.episode_steps if isinstance(config, SkillDiscoveryConfig) else COVERAGE_STEPS
+    paths, of = paths_of(trained, NUM_SKILLS, steps, _SEED)
+    return plot_coverage(paths, config.world.workspace, directory.path / "coverage.png", config.name, of=of)
+
+
+def _draw_video(directory: RunDirectory, trained: Trained) -> Path:
+    kind = "skills" if trained.kind == "skills" else "rounds" if trained.alice is not None else "episodes"
+    path = directory.path / f"{kind}.mp4"
+    directory.keep_recording(path)
+    return film(trained, path, NUM_RECORDED_ROUNDS if kind == "rounds" else NUM_RECORDED_EPISODES, _SEED)
+
+
+def paths_of(trained: Trained, num: int, num_steps: int, seed: int) -> tuple[StateArray, str]:
+    """(num, num_steps + 1, 3) metres where random skills or compositions of primitives move the object; what one is.
+
+    Raises:
+        TandemError: it has neither.
+    """
+    if trained.kind == "skills":
+        return skill_paths(trained.skills, trained.world, num_skills=num, num_steps=num_steps, seed=seed), "skill"
+    return (
+        skill_trajectories(trained.primitives, trained.world, num_skills=num, num_steps=num_steps, seed=seed),
+        "composition",
+    )
+
+
+def film(
+    trained: Trained,
+    path: Path,
+    num: int,
+    seed: int,
+    options: video.FilmOptions | None = None,
+    goals: GoalKind | StateArray | None = None,
+) -> Path:
+    """Film random skills, rounds of a run's Alice and Bob, or episodes on goals; see ``record_on_goals``.
+
+    Args:
+        trained: who acts.
+        path: of the film.
+        num: of skills, rounds or episodes.
+        seed: of all of them.
+        options: of the film.
+        goals: that are filmed in place of rounds; skills have some on a task alone.
+
+    Raises:
+        TandemError: see ``write_video``; or no goal leads what was trained.
+    """
+    config = trained.config
+    if isinstance(config, SkillDiscoveryConfig) and trained.kind == "skills" and trained.task is None:
+        steps = config.skills.episode_steps
+        recorded = recording.record_skills(trained.skills, config.world, num_skills=num, num_steps=steps, seed=seed)
+    elif isinstance(config, SelfPlayConfig) and trained.alice is not None and goals is None:
+        rounds = recording.record_rounds(config, trained.alice, trained.policy, num_rounds=num, seed=seed)
+        return video.write_video(rounds, config.world, path, options)
+    else:
+        recorded = recording.record_on_goals(trained.expect_goals("tandem render"), num, seed, goals)
+    return video.write_episode_video(recorded, trained.world, path, options)

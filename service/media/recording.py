@@ -31,6 +31,7 @@ from service.generator.records import GoalRecords
 from service.generator.snapshot import GeneratorSnapshot
 from service.generator.validity import Verdict
 from service.policies.frozen_skills import FrozenSkills
+from service.registry.loading import Trained
 
 _NUM_WORLDS = 64
 _MAX_ROLLOUTS = 3
@@ -143,6 +144,30 @@ def record_episodes(
     )
     states, goals, reached = map(np.stack, zip(*kept, strict=True))
     return RecordedEpisodes(states, goals[0], reached, np.stack(acting.actions))
+
+
+def record_on_goals(
+    trained: Trained, num_episodes: int, seed: int, goals: GoalKind | StateArray | None = None
+) -> RecordedEpisodes:
+    """Play episodes in which what was trained is tried, and keep every state.
+
+    Args:
+        trained: who acts.
+        num_episodes: of random goals.
+        seed: of starts and random goals.
+        goals: a kind of random goals, or (N, 3) metres, one for each of N episodes; None: of its usual kind.
+    """
+    points = goals if isinstance(goals, np.ndarray) else None
+    return record_episodes(
+        trained.player(),
+        trained.world,
+        goals if isinstance(goals, str) else trained.goals,
+        num_episodes=num_episodes if points is None else len(points),
+        num_steps=trained.num_steps,
+        success_distance_m=trained.success_distance_m,
+        seed=seed,
+        goal=points,
+    )
 
 
 def record_skills(

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError
 
 from service.base.errors import TandemError, one_line
 from service.base.types import StateArray
-from service.config.frozen import FrozenModel
+from service.config.frozen import FrozenModel, first_error
 from service.config.tree import read_yaml
 from service.config.world import WorldConfig
 from service.robot.disturbed import DisturbanceConfig, DisturbedPoses, DisturbedRobot
@@ -135,12 +135,3 @@ def connect(config: BackendConfig, world: WorldConfig, *, seed: int = 0) -> Back
         return made
     poses = DisturbedPoses(made.poses, made.robot.now_s, config.disturbance, seed=seed)
     return replace(made, robot=DisturbedRobot(made.robot, config.disturbance), poses=poses)
-
-
-def first_error(error: ValidationError) -> str:
-    """The first thing that is wrong with plain values, in a few words."""
-    first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"]) or "the top level"
-    if first["type"] == "extra_forbidden":
-        return f"unknown key {key!r}"
-    return f"{key} = {first['input']!r}: {first['msg']}"

@@ -18,13 +18,12 @@ from pydantic import Field, ValidationError
 from service.base.errors import RobotError, TandemError
 from service.base.files import os_errors, write_atomic
 from service.base.types import FloatArray, StateArray
-from service.config.frozen import FrozenModel
+from service.config.frozen import FrozenModel, first_error
 from service.config.tree import read_yaml
 from service.config.world import WorldConfig
 from service.envs.batch import DISPLACEMENT_M
 from service.envs.observations import ACTION, POSITIONS
 from service.envs.robot import described
-from service.robot.backends import first_error
 from service.robot.interface import RobotInterface
 from service.robot.loop import Bridge, BridgeConfig
 from service.robot.safety import SafetyConfig, always_held

@@ -1,23 +1,37 @@
-"""Goals of a robot, one after another: which policies play them, where they are, and what came of them."""
+"""Goals of a robot, one after another: which policies play them, where they are, what came of them, and the log of it.
+
+A log is JSON lines: the first says what was run, each of the others what happened in a control step.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from service.base.errors import RobotError, TandemError
+from service.base.jsonl import JsonlWriter, read_jsonl
 from service.base.types import StateArray
+from service.config.frozen import first_error
 from service.config.world import WorldConfig
+from service.envs.batch import WorldBatch
 from service.envs.sampling import Places, draw_goals, draw_objects, inside_fixtures
+from service.media.recording import RecordedEpisodes
 from service.methods.compose import check_robot
 from service.registry.loading import Trained
 from service.robot.backends import Backend
 from service.robot.limits import Box
 from service.robot.loop import Bridge
 
+FORMAT_VERSION = 1
+"""Of a log."""
 _ROUNDING_M = 1e-6
+_LONG_WAY = 30
+"""Iterations that find the arm's joints from its home."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,3 +134,77 @@ def _goal_from(backend: Backend, rng: np.random.Generator, policy: Trained) -> S
     places = Places(object_m[None], np.empty((1, 0)), np.empty((1, 0, 3)))
     goal: StateArray = draw_goals(policy.goals, rng, policy.world, policy.success_distance_m, places)[0]
     return goal
+
+
+# --- the log ---------------------------------------------------------------------------------------------------------
+
+
+class RobotLog:
+    """Writes a log.
+
+    Args:
+        path: a file that is not there yet.
+        header: what is run: policy, robot, configuration.
+        world: of the policy.
+
+    Raises:
+        TandemError: the file is there, or cannot be written.
+    """
+
+    def __init__(self, path: Path, header: Mapping[str, Any], world: WorldConfig) -> None:
+        if path.exists():
+            raise TandemError(f"--log {path}: there is a file already; name another")
+        self._writer = JsonlWriter(path)
+        self._writer.append({"format_version": FORMAT_VERSION, **header, "world": world.model_dump(mode="json")})
+        self.episode = 0
+        """Number that steps are logged under."""
+
+    def record(self, row: Mapping[str, Any]) -> None:
+        """Add a step; see ``loop.Bridge.run``."""
+        self._writer.append({"episode": self.episode, **row})
+
+
+def read_log(path: Path) -> tuple[WorldConfig, RecordedEpisodes]:
+    """The world of a log, and what was logged as its states: effector and object where they were measured.
+
+    The object is drawn upright, as only its place was seen, and shorter episodes end with a still picture.
+
+    Raises:
+        TandemError: no such file, no log of a robot, or nothing was logged.
+    """
+    header, *rows = read_jsonl(path) or [{}]
+    if header.get("format_version") != FORMAT_VERSION or not {"world", "success_distance_m"} <= header.keys():
+        raise TandemError(f"{path} is no log of tandem robot run, format {FORMAT_VERSION}; name what --log wrote")
+    try:
+        world = WorldConfig.model_validate(header["world"])
+    except ValidationError as error:
+        raise TandemError(f"{path}: its world cannot be read: {first_error(error)}") from None
+    episodes: dict[int, list[dict[str, Any]]] = {}
+    for row in rows:
+        if "effector_m" in row:
+            episodes.setdefault(row["episode"], []).append(row)
+    if not episodes:
+        raise TandemError("the log has no step in which anything was measured: nothing to show")
+    return world, _recorded(world, list(episodes.values()), header["success_distance_m"])
+
+
+def _recorded(world: WorldConfig, episodes: list[list[dict[str, Any]]], success_distance_m: float) -> RecordedEpisodes:
+    """The steps of each episode as states of the world."""
+    num_steps = max(map(len, episodes))
+    padded = [steps + steps[-1:] * (num_steps - len(steps)) for steps in episodes]
+    effector, fingers, places = (
+        np.array([[step[key] for step in steps] for steps in padded], dtype=np.float64).swapaxes(0, 1)  # (T, N, ...)
+        for key in ("effector_m", "fingers_m", "object_m")
+    )
+    goal = np.array([steps[0]["goal_m"] for steps in episodes])
+    with WorldBatch(world, len(episodes), num_threads=1) as worlds:
+        arm, layout = worlds.robot.arm, worlds.layout
+        states = np.tile(worlds.states, (num_steps, 1, 1))
+        joints = np.tile(arm.home, (len(episodes), 1))
+        for step in range(num_steps):
+            joints = arm.solve(joints, effector[step], num_iterations=2 if step else _LONG_WAY)
+            states[step][:, layout["joints"]] = joints
+            states[step][:, layout["fingers"]] = worlds.robot.finger_values(fingers[step].sum(axis=1))
+            states[step][:, layout["object"]] = places[step]
+    reached = np.linalg.norm(places - goal, axis=2) <= success_distance_m
+    return RecordedEpisodes(states, goal, reached)

@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -40,16 +39,6 @@ class UnsavedError(CheckpointError):
     """A run has ended, and its last checkpoint could not be written."""
 
     exit_code = 1
-
-
-@dataclass(frozen=True, slots=True)
-class RunResult:
-    """Reason and length of a run that has ended."""
-
-    reason: str
-    """``finished`` (budget), ``converged`` (nothing more to learn) or ``interrupted``."""
-    iteration: int
-    num_env_steps: int
 
 
 class Run:
@@ -127,12 +116,15 @@ class Run:
         """End soon, with a checkpoint. Safe to call from a signal handler."""
         self._stop_requested = True
 
-    def run(self, on_iteration: OnIteration = lambda metrics: None, on_beat: OnBeat = lambda: None) -> RunResult:
+    def run(self, on_iteration: OnIteration = lambda metrics: None, on_beat: OnBeat = lambda: None) -> str:
         """Learn and record until the budget is spent, the method has converged, or a stop is requested.
 
         Args:
             on_iteration: called with the metrics of every iteration.
             on_beat: called about every second where iterations take longer.
+
+        Returns:
+            Why it has ended: ``finished`` (budget), ``converged`` (nothing more to learn) or ``interrupted``.
 
         Raises:
             DivergedError: a policy has.
@@ -143,7 +135,7 @@ class Run:
         while (reason := self._stop_reason()) is None:
             self._advance()
         self._save_last()
-        return RunResult(reason, self.iteration, self.num_env_steps)
+        return reason
 
     def close(self) -> None:
         """End what the method has started; a second call does nothing."""

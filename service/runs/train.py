@@ -31,7 +31,7 @@ from service.registry.names import Version, check_name
 from service.registry.publishing import check_publishable, measure_bob, measure_skills, publish_run
 from service.registry.registry import Registry
 from service.runs.report import Report
-from service.runs.run import OnIteration, Run, RunResult
+from service.runs.run import OnIteration, Run
 from service.runs.signals import InterruptError, StopSignals
 from service.store.address import address_from_environment
 from service.store.checkpoints import CheckpointStore
@@ -54,7 +54,10 @@ _logger = logging.getLogger(__name__)
 class Finished:
     """Results of a training."""
 
-    result: RunResult
+    reason: str
+    """``finished``, ``converged`` or ``interrupted``; see ``Run.run``."""
+    iteration: int
+    num_env_steps: int
     timing: str
     """Where the time went, as a text tree."""
     files: dict[str, Path] = field(default_factory=dict)
@@ -159,8 +162,8 @@ def train(
                     resume = True
                 else:
                     said = f", published {done.version}" if done.version is not None else ""
-                    at = f"iteration {done.result.iteration}, {done.result.num_env_steps} env steps"
-                    log(f"the run is {done.result.reason} at {at}{said}")
+                    at = f"iteration {done.iteration}, {done.num_env_steps} env steps"
+                    log(f"the run is {done.reason} at {at}{said}")
                     return done
             time.sleep(BACK_OFF_S * (2 ** (num_lost - 1) - 1))
 
@@ -225,12 +228,12 @@ def _run(
 
     report.begin(run)
     with signals.asking(stop):
-        result = run.run(tell, partial(report.beat, run))
-    done = Finished(result, timing=run.method.timing.tree())
-    if result.reason != "interrupted" and signals.first is None:
+        reason = run.run(tell, partial(report.beat, run))
+    done = Finished(reason, run.iteration, run.num_env_steps, run.method.timing.tree())
+    if reason != "interrupted" and signals.first is None:
         with suppress(InterruptError), report.beating():
             done = _finish(done, run, registry, publish, report)
-    complete = result.reason if signals.first is None else "interrupted"  # --resume does what is left
+    complete = reason if signals.first is None else "interrupted"  # --resume does what is left
     report.end(cast(RunState, complete), published=str(done.version) if done.version is not None else None)
     return replace(done, signal=signals.first)
 
@@ -246,7 +249,7 @@ def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, repor
     report.measured(metrics)
     try:
         if publish and config.publishable:
-            known = metrics | {"env_steps": done.result.num_env_steps}
+            known = metrics | {"env_steps": done.num_env_steps}
             version = publish_run(directory, Registry(Path(registry)), config, parameters, known)
     except TandemError as error:
         raise UnfinishedError(f"learning is over and saved, but not published: {error}; --resume does it") from error

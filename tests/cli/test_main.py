@@ -187,13 +187,12 @@ def test_demo_is_a_short_pretraining_with_a_registry_of_its_own(asked):
 
 def test_demo_ends_with_what_comes_with_tandem_and_what_to_type(monkeypatch, tmp_path):
     from service.actors import evaluation
-    from service.runs.run import RunResult
     from service.runs.train import Finished
 
     metrics = {"evaluation/table_success_last": 0.12, "evaluation/air_success_last": 0.03}
 
     def pretrain(*args, **kwargs):
-        return Finished(RunResult("finished", 1, 7), "total 1 s", {}, Version("panda-cube-demo", 1), metrics)
+        return Finished("finished", 1, 7, "total 1 s", {}, Version("panda-cube-demo", 1), metrics)
 
     real = evaluation.evaluate
     few = {"num_episodes": 4, "num_steps": 2}

@@ -13,14 +13,14 @@ import yaml
 from typer.testing import CliRunner
 
 from service.base.errors import RobotError, TandemError
+from service.base.jsonl import read_jsonl
 from service.cli.main import app
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
 from service.registry.loading import Trained
 from service.robot.backends import Backend
-from service.robot.log import read_log, states_of
 from service.robot.loop import Bridge, BridgeConfig
-from service.robot.running import parse_goal, play
+from service.robot.running import parse_goal, play, read_log
 from tests.robot.fakes import FakeRobot, Steady
 
 FAST = ["--set", "set_points_per_step=2"]
@@ -43,16 +43,16 @@ def test_goals_are_played_logged_and_drawn_from_the_log(tmp_path):
     )
     assert ran.exit_code == 0, ran.output
     assert json.loads(ran.stdout) == {"policy": "panda-cube@6 (bundled)", "robot": "mujoco", "reached": 0, "goals": 2}
-    logged = read_log(log)
-    assert logged.header["bridge"]["set_points_per_step"] == 2
-    assert [len(steps) for steps in logged.episodes] == [6, 6]
-    row = logged.episodes[1][3]
+    header, *rows = read_jsonl(log)
+    assert header["bridge"]["set_points_per_step"] == 2
+    assert [(row["episode"], row["step"]) for row in rows] == [(episode, step) for episode in (0, 1) for step in range(6)]
+    row = rows[9]
     assert len(row["set_points_m"]) == len(row["measured_m"]) == 2
-    drawn = states_of(logged)
+    world, drawn = read_log(log)
     assert drawn.states.shape[:2] == (6, 2)
     from service.envs.batch import WorldBatch
 
-    with WorldBatch(logged.world, 2, num_threads=1) as worlds:
+    with WorldBatch(world, 2, num_threads=1) as worlds:
         worlds.restore(drawn.states[3])
         np.testing.assert_allclose(worlds.ee_position[1], row["effector_m"], atol=1e-3)
         np.testing.assert_allclose(worlds.object_position[1], row["object_m"])

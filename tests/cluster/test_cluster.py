@@ -30,7 +30,7 @@ from service.runs.run import Run
 from service.runs.train import open_run
 from service.store.checkpoints import CheckpointStore
 from service.store.run_directory import RunDirectory
-from tests.runs.runs import FullForAWhile, assert_one_line, is_alive, newest, play, read_lines, tiny_config
+from tests.runs.runs import FullForAWhile, assert_one_line, is_alive, newest, play, read_lines, run_on, tiny_config
 
 ENDLESS = 10**9
 
@@ -66,7 +66,7 @@ def run_cluster(
             run.request_stop()
 
     try:
-        return run, run.run(each, lambda: on_beat(run) if on_beat else None)
+        return run, run_on(run, each, lambda: on_beat(run) if on_beat else None)
     finally:
         run.close()
         directory.close()

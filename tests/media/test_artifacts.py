@@ -18,7 +18,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(artifacts, "NUM_SKILLS", 2)
     monkeypatch.setattr(artifacts, "COVERAGE_STEPS", 2)
     monkeypatch.setattr("service.media.recording.record_rounds", lambda *args, **kwargs: [])
-    monkeypatch.setattr("service.media.video.write_video", lambda takes, world, path: path)
+    monkeypatch.setattr("service.media.video.write_video", lambda takes, world, path, options: path)
 
 
 def test_every_picture_by_what_it_shows(directory):

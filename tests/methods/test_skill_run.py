@@ -16,6 +16,7 @@ from service.registry.registry import Registry
 from service.runs.train import open_run, train
 from service.store.checkpoints import CheckpointStore
 from service.store.run_directory import RunDirectory
+from tests.runs.runs import run_on
 
 
 def small_config(method="lsd", **run):
@@ -43,7 +44,7 @@ def play(path, config, *, resume=False, stop_after=None):
         if metrics["iteration"] == stop_after:
             run.request_stop()
 
-    result = run.run(stop)
+    result = run_on(run, stop)
     run.close()
     directory.close()
     return result

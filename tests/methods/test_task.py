@@ -64,7 +64,7 @@ def home(tmp_path_factory, champion, no_video):
     home = tmp_path_factory.mktemp("tasks")
     for method in ("ours", "scratch-monolithic"):
         done = begin(home / "runs" / method, small_trial(method), home / "registry", publish=method == "ours")
-        assert done.result.reason == "finished"
+        assert done.reason == "finished"
     return home
 
 

@@ -11,6 +11,7 @@ import sys
 import time
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import yaml
@@ -76,6 +77,19 @@ TINY_TASK = [
 """Options of a task in iterations of 200 env steps, 0.2 s each; without rendering it is over in seconds."""
 
 
+class Ended(NamedTuple):
+    """How a run ended."""
+
+    reason: str
+    iteration: int
+    num_env_steps: int
+
+
+def run_on(run, *callbacks):
+    """Let a run go on to its end."""
+    return Ended(run.run(*callbacks), run.iteration, run.num_env_steps)
+
+
 class KilledError(Exception):
     """Stands for kill -9 inside this process: nothing after it is done."""
 
@@ -103,7 +117,7 @@ def play(path, config=None, *, resume=False, kill_after=None, on_iteration=None)
             raise KilledError
 
     try:
-        return run, run.run(each)
+        return run, run_on(run, each)
     except KilledError:
         return run, None
     finally:

@@ -90,7 +90,7 @@ def test_a_resumed_run_takes_a_lower_learning_rate(tmp_path):
     assert run.method.learner._bob.optimizer.learning_rate == pytest.approx(2e-6)  # the highest that adapts from 1e-6
     assert run.method.learner._alice.optimizer.learning_rate == newest(tmp_path).arrays["learner/alice/learning_rate"]
     assert RunDirectory(tmp_path).read_config().learner.bob.learning_rate == 1e-6
-    assert run.run().reason == "finished"
+    assert run.run() == "finished"
     assert newest(tmp_path).arrays["learner/bob/learning_rate"] <= 2e-6
 
 

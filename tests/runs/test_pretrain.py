@@ -71,7 +71,7 @@ def goes_on(home, steps=None, **kwargs):
 
 def test_a_finished_run_is_evaluated_drawn_and_published_with_all_that_a_user_needs(published):
     home, done = published
-    assert done.result.reason == "finished"
+    assert done.reason == "finished"
     assert done.files == {"curves": home / "run" / "curves.png"}
     kinds = [f"evaluation/{kind}_success_{when}" for kind in ("table", "air", "mixed") for when in ("last", "ever")]
     assert sorted(done.metrics) == sorted(kinds)
@@ -82,7 +82,7 @@ def test_a_finished_run_is_evaluated_drawn_and_published_with_all_that_a_user_ne
     assert parameters.keys() == saved.keys()
     assert all(np.array_equal(parameters[name], array) for name, array in saved.items())
     assert parse_config(manifest.config, where="a test") == tiny_config(total_env_steps=400)
-    assert manifest.metrics == done.metrics | {"env_steps": done.result.num_env_steps}
+    assert manifest.metrics == done.metrics | {"env_steps": done.num_env_steps}
     assert (str(done.version), manifest.spaces["action"], manifest.spaces["observation"]) == ("tiny@1", 4, 14)
     assert len(manifest.normalisation["offset"]) == len(manifest.normalisation["scale"]) == 14
 
@@ -98,7 +98,7 @@ def test_the_final_evaluation_is_played_on_goals_of_its_own(tmp_path, quick, mon
     monkeypatch.setattr(evaluation, "draw_goals", watched)
     done = run_pretrain(tmp_path, tiny_config(total_env_steps=400, evaluation_interval=1))
     *curve, final = (drawn[start : start + 3] for start in range(0, len(drawn), 3))
-    assert len(curve) == done.result.iteration >= 2
+    assert len(curve) == done.iteration >= 2
     for goals in (*curve, final):
         assert [kind for kind, _ in goals] == ["table", "air", "mixed"]
     for goals in curve:
@@ -110,7 +110,7 @@ def test_the_final_evaluation_is_played_on_goals_of_its_own(tmp_path, quick, mon
 
 def test_publishing_can_be_left_to_a_resume(tmp_path, quick):
     done = run_pretrain(tmp_path, publish=False)
-    assert (done.result.reason, done.version) == ("finished", None)
+    assert (done.reason, done.version) == ("finished", None)
     assert done.metrics != {}
     assert not (tmp_path / "registry").exists()
     assert str(run_pretrain(tmp_path, resume=True).version) == "tiny@1"
@@ -119,7 +119,7 @@ def test_publishing_can_be_left_to_a_resume(tmp_path, quick):
 def test_a_finished_run_that_goes_on_publishes_another_version(home):
     done = goes_on(home, 600)
     assert str(done.version) == "tiny@2"
-    assert done.result.num_env_steps >= 600
+    assert done.num_env_steps >= 600
     registry = Registry(home / "registry")
     assert [registry.manifest(f"tiny@{number}").parent for number in (1, 2)] == [None, "tiny@1"]
 
@@ -136,7 +136,7 @@ def test_a_finished_run_with_nothing_left_to_do_publishes_nothing_and_mends_what
 
 def test_a_version_has_the_parent_its_run_published_before_also_after_an_interruption(home):
     interrupted = goes_on(home, 1500, on_iteration=lambda _: os.kill(os.getpid(), signal.SIGINT))
-    assert interrupted.result.reason == "interrupted"
+    assert interrupted.reason == "interrupted"
     # the parent of none, though the newest of the name
     Registry(home / "registry").publish("tiny", {"a": np.zeros(1)}, spaces={}, normalisation={}, config={}, metrics={})
     assert str(goes_on(home, 1500).version) == "tiny@3"
@@ -178,7 +178,7 @@ def test_a_signal_ends_the_run_after_the_iteration(tmp_path, quick, number):
             os.kill(os.getpid(), number)
 
     done = run_pretrain(tmp_path, on_iteration=interrupt)
-    assert (done.result.reason, done.result.iteration) == ("interrupted", 2)
+    assert (done.reason, done.iteration) == ("interrupted", 2)
     assert (done.version, done.files, done.metrics, done.signal) == (None, {}, {}, number)
     assert newest(tmp_path / "run").step == 2
     assert not (tmp_path / "registry").exists()

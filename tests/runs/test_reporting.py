@@ -68,7 +68,7 @@ def test_a_run_tells_how_far_it_is_and_how_it_ended(tmp_path):
     assert [each.state for each in seen] == ["running"] * len(seen)
     last = status(tmp_path)
     assert (last.state, last.run_id, last.name, last.runtime) == ("finished", "cube", "tiny", "local")
-    assert (last.iteration, last.num_env_steps) == (done.result.iteration, done.result.num_env_steps)
+    assert (last.iteration, last.num_env_steps) == (done.iteration, done.num_env_steps)
     assert (last.policy_version, last.num_rollouts_counted) == (last.iteration - 1, last.iteration - 1)
     assert (last.published, last.last_error, last.warnings, last.stopping) == ("tiny@1", None, (), False)
     assert last.env_steps_per_s > 0
@@ -100,7 +100,7 @@ def test_a_stop_request_ends_the_run_after_its_iteration_saved(tmp_path):
 
     config = tiny_config(total_env_steps=1500)
     done = run(tmp_path, config, on_iteration=stop_at(3))
-    assert (done.result.reason, done.result.iteration, done.version) == ("interrupted", 3, None)
+    assert (done.reason, done.iteration, done.version) == ("interrupted", 3, None)
     last = status(tmp_path)
     assert (last.state, last.iteration, last.stopping) == ("interrupted", 3, False)
     run(tmp_path, config, resume=True)  # the request was for the process that has ended
@@ -247,7 +247,7 @@ def test_a_run_whose_redis_is_killed_and_comes_back(tmp_path, redis, monkeypatch
 
     config = tiny_config(total_env_steps=1500)
     done = run(tmp_path, config, on_iteration=each)
-    assert done.result.reason == "finished"
+    assert done.reason == "finished"
     assert_one_line(warned[0], f"Redis at {redis.address} has taken nothing for")
     reader = RedisReader(redis.address)
     assert reader.metrics("cube") == read_lines(tmp_path / "runs" / "cube" / "metrics.jsonl")
@@ -278,8 +278,8 @@ def test_a_status_service_without_the_shared_disk_serves_a_run_and_stops_it(tmp_
     with StatusServer(open_reader(tmp_path / "empty"), Registry(tmp_path / "registry"), token=TOKEN, port=0) as server:
         done = run(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=look)
         last = httpx.get(f"{server.url}/v1/runs/cube", headers=BEARER, **CLIENT).json()
-    assert done.result.reason == "interrupted"
-    assert (last["state"], last["epoch"], last["iteration"]) == ("interrupted", 1, done.result.iteration)
+    assert done.reason == "interrupted"
+    assert (last["state"], last["epoch"], last["iteration"]) == ("interrupted", 1, done.iteration)
     assert seen == {"runs": ["cube"], "grid": list(seen["grid"]), "gauge": True}
     assert list((tmp_path / "empty").iterdir()) == []
 
@@ -290,7 +290,7 @@ def test_a_redis_that_is_not_there_is_said_before_anything_is_learned(tmp_path, 
         run(tmp_path)
     assert_one_line(error.value, f"Redis at {redis.address}", "TANDEM_REDIS_URL")
     redis.revive()
-    assert run(tmp_path).result.reason == "finished"  # the directory is still free
+    assert run(tmp_path).reason == "finished"  # the directory is still free
 
 
 def test_the_same_run_id_elsewhere(tmp_path, redis):
