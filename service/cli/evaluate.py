@@ -36,16 +36,6 @@ if TYPE_CHECKING:
     from service.registry.loading import Trained
 
 _Seed = Annotated[int, typer.Option(help="Of the episodes.", min=0)]
-SizeOption = Annotated[str, typer.Option("--size", metavar="WxH", help="Of the whole film, pixels.")]
-CameraOption = Annotated[
-    str,
-    typer.Option(
-        "--camera",
-        metavar="VIEW",
-        help="front, far, close, side, behind or top; also, or after it, azimuth=DEG,elevation=DEG,distance=M.",
-    ),
-]
-SpeedOption = Annotated[float, typer.Option("--speed", help="0.5: half as fast as in the world.", min=0.05, max=20)]
 GoalsOption = Annotated[
     str | None,
     typer.Option(
@@ -54,8 +44,7 @@ GoalsOption = Annotated[
         help="table, air, volume or mixed; or points in metres, such as '0.1,0,0.2; 0,-0.1,0.025'.",
     ),
 ]
-OutOption = Annotated[Path, typer.Option("--out", metavar="FILE", help="Film to write: .mp4 or .gif.")]
-SIZE, CAMERA, SPEED, OUT = "1280x720", "front", 1.0, Path("video.mp4")
+SIZE, CAMERA, SPEED = "1280x720", "front", 1.0
 
 _SIZES = (64, 4096)
 
@@ -236,10 +225,16 @@ def render(
     episodes: Annotated[int, typer.Option(help="Rounds, episodes or skills to record.", min=1, max=64)] = 4,
     goals: GoalsOption = None,
     seed: _Seed = 0,
-    out: OutOption = OUT,
-    size: SizeOption = SIZE,
-    camera: CameraOption = CAMERA,
-    speed: SpeedOption = SPEED,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Film to write: .mp4 or .gif.")] = Path("video.mp4"),
+    size: Annotated[str, typer.Option(metavar="WxH", help="Of the whole film, pixels.")] = SIZE,
+    camera: Annotated[
+        str,
+        typer.Option(
+            metavar="VIEW",
+            help="front, far, close, side, behind or top; also, or after it, azimuth=DEG,elevation=DEG,distance=M.",
+        ),
+    ] = CAMERA,
+    speed: Annotated[float, typer.Option(help="0.5: half as fast as in the world.", min=0.05, max=20)] = SPEED,
     primitives: ActsWithOption = None,
     registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
