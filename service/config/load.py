@@ -15,9 +15,6 @@ from service.config.frozen import NO_KEYS, first_error
 from service.config.run import Config
 from service.config.tree import apply_override, read_yaml
 
-DEFAULT_METHOD = "self-play"
-"""The method of a configuration that names none."""
-
 
 def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -> Config:
     """Read a run's configuration.
@@ -47,7 +44,7 @@ def parse_config(tree: dict[str, Any], *, where: str) -> Config:
     Raises:
         ConfigError: unknown method or key, or value out of range.
     """
-    method = tree.get("method", DEFAULT_METHOD)
+    method = tree.get("method", "self-play")
     if not isinstance(method, str):
         raise ConfigError(f"{where}: method = {method!r}: expected a name")
     try:
