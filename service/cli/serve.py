@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import socket
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -50,14 +50,13 @@ def serve(
     if not runs.is_dir():
         raise StatusError(f"no directory {runs}; name with --runs the one that holds run directories")
     token = read_token(token_file)
-    chosen = port
-    if chosen is None:
+    chosen = DEFAULT_PORT if port is None else port
+    if port is None:
         with suppress(OSError):  # what is wrong with the host is said below
             chosen = free_port(host, DEFAULT_PORT)
-    if port is None and chosen not in (None, DEFAULT_PORT):
-        logging.getLogger(__name__).info("port %d is taken, so this is at port %d", DEFAULT_PORT, chosen)
-    place: dict[str, Any] = {"host": host, "port": DEFAULT_PORT if chosen is None else chosen, "runs_dir": runs}
-    server = StatusServer(open_reader(runs), Registry(registry), token=token, **place)
+        if chosen != DEFAULT_PORT:
+            logging.getLogger(__name__).info("port %d is taken, so this is at port %d", DEFAULT_PORT, chosen)
+    server = StatusServer(open_reader(runs), Registry(registry), token=token, host=host, port=chosen, runs_dir=runs)
     typer.echo(f"runs of {runs}, primitives of {registry}: {server.url}")
     if token is None:
         typer.echo(f"read-only, for this machine: with {VARIABLE} set, runs can be stopped and aliases moved")
@@ -87,7 +86,7 @@ def play(
     with StopSignals() as signals:
         with loading():
             world = LiveWorld(players, host, port, seed)
-        with world as live, signals.asking(lambda: None):
+        with closing(world) as live, signals.asking(lambda: None):
             typer.echo(f"{players.title}: {live.url}")
             typer.echo(
                 f"from another machine: ssh -L {live.port}:127.0.0.1:{live.port} {socket.gethostname()}, "

@@ -109,9 +109,10 @@ class PyBulletRobot:
 
     def read(self) -> RobotState:
         """Measure the arm as it is now."""
-        position, rotation = self._link(_HAND)
+        hand = self._bullet.getLinkState(self._robot, _HAND, computeForwardKinematics=True)
+        rotation = np.array(self._bullet.getMatrixFromQuaternion(hand[5])).reshape(3, 3)
         fingers = [state[0] for state in self._bullet.getJointStates(self._robot, _FINGERS)]
-        return RobotState(self.now_s(), position + _TIP_M * rotation[:, 2], np.array(fingers))
+        return RobotState(self.now_s(), hand[4] + _TIP_M * rotation[:, 2], np.array(fingers))
 
     def command(self, command: Command) -> None:
         """Take a new set-point; after ``stop``, refuse until ``reset``.
@@ -218,10 +219,6 @@ class PyBulletRobot:
     def _start_m(self) -> tuple[float, float, float]:
         area = self.world.workspace
         return area.center_x_m, area.center_y_m, self.world.start_height_m
-
-    def _link(self, link: int) -> tuple[StateArray, StateArray]:
-        state = self._bullet.getLinkState(self._robot, link, computeForwardKinematics=True)
-        return np.array(state[4]), np.array(self._bullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)
 
     def _set_joints(self, values: Sequence[float]) -> None:
         for joint, value in zip(_ARM, values, strict=True):

@@ -48,7 +48,7 @@ def resumed_config(directory: RunDirectory | Path, overrides: list[str], file: P
     changing = [override for override in overrides if override not in fixed]
     if file is not None:
         given = load_config(file, fixed)
-        for key, (old, new) in _differences(_tree(saved), _tree(as_saved(given))).items():
+        for key, (old, new) in _differences(saved.model_dump(mode="json"), as_saved(given)).items():
             if not f"{key}=".startswith(saved.resumable):
                 raise ConfigError(
                     f"{file}: {key} = {new!r}, but the run has {old!r}; a resumed run keeps its configuration: leave "
@@ -71,7 +71,7 @@ def changed_settings(saved: dict[str, Any], config: Config, directory: Path) -> 
     Raises:
         CheckpointError: a setting that may not change.
     """
-    changed = _differences(saved, _tree(config))
+    changed = _differences(saved, config)
     for key, (old, new) in changed.items():
         if not f"{key}=".startswith(config.resumable):
             raise CheckpointError(
@@ -81,11 +81,7 @@ def changed_settings(saved: dict[str, Any], config: Config, directory: Path) -> 
     return changed
 
 
-def _tree(config: Config) -> dict[str, Any]:
-    return config.model_dump(mode="json")
-
-
-def _differences(saved: dict[str, Any], given: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+def _differences(saved: dict[str, Any], given: Config) -> dict[str, tuple[Any, Any]]:
     """By key the values in two configurations, where they differ; None where one has no such key."""
-    was, now = dict(leaves(saved)), dict(leaves(given))
+    was, now = dict(leaves(saved)), dict(leaves(given.model_dump(mode="json")))
     return {key: (was.get(key), now.get(key)) for key in {**was, **now} if was.get(key) != now.get(key)}

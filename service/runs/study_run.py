@@ -25,8 +25,6 @@ from service.runs.signals import PARENT, PASSED_ON, STOPPING
 from service.store.models import OUTPUT_FILE, RunState, read_status
 from service.store.run_directory import RunDirectory
 
-ENDED = ("finished", "converged")
-"""States in which a run has learned all it was to learn."""
 GO_ON, STOP, END_NOW = range(3)
 """What a run is asked for: a stop is after its iteration, saved."""
 POLL_S = 0.2
@@ -53,7 +51,7 @@ class StudyRun(FrozenModel):
     @property
     def has_ended(self) -> bool:
         """Whether it has learned all it was to learn."""
-        return self.state in ENDED
+        return self.state in ("finished", "converged")
 
     def has_more(self, total_env_steps: int) -> bool:
         """Whether it is to learn more: it has not ended, or has a larger budget by now."""

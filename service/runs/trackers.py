@@ -11,8 +11,6 @@ from typing import Any
 from service.base.errors import TandemError, one_line
 
 _logger = logging.getLogger(__name__)
-_COUNTED = "env_steps"
-"""The metric by which records are numbered."""
 _ENDS = ("close", "finish")
 """Names of what ends a tracker, one of which is called where it is there."""
 
@@ -50,7 +48,7 @@ class Trackers:
         """Give a record, which has ``env_steps`` in it, to all that have not thrown."""
         for reference, tracker in list(self._going.items()):
             try:
-                tracker.log(dict(metrics), step=int(metrics[_COUNTED]))
+                tracker.log(dict(metrics), step=int(metrics["env_steps"]))
             except Exception as error:  # whatever it is, the run is worth more
                 self._end(reference, error)
 

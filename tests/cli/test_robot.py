@@ -45,7 +45,9 @@ def test_goals_are_played_logged_and_drawn_from_the_log(tmp_path):
     assert json.loads(ran.stdout) == {"policy": "panda-cube@6 (bundled)", "robot": "mujoco", "reached": 0, "goals": 2}
     header, *rows = read_jsonl(log)
     assert header["bridge"]["set_points_per_step"] == 2
-    assert [(row["episode"], row["step"]) for row in rows] == [(episode, step) for episode in (0, 1) for step in range(6)]
+    assert [(row["episode"], row["step"]) for row in rows] == [
+        (episode, step) for episode in (0, 1) for step in range(6)
+    ]
     row = rows[9]
     assert len(row["set_points_m"]) == len(row["measured_m"]) == 2
     world, drawn = read_log(log)

@@ -6,6 +6,7 @@ import socket
 import sys
 import threading
 import time
+from contextlib import closing
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from tests.status.browser import CHROMIUM, Visit, chromium
 
 @pytest.fixture(scope="module")
 def shared(champion):
-    with LiveWorld(champion, port=0, seed=1) as live:
+    with closing(LiveWorld(champion, port=0, seed=1)) as live:
         yield live
 
 
