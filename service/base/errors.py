@@ -149,6 +149,11 @@ def one_line(text: str, max_characters: int = 2000) -> str:
     return f"{line[:half]} ... {line[-half:]}"
 
 
+def in_metres(point: Iterable[float]) -> str:
+    """A place in words, to the millimetre."""
+    return ", ".join(f"{each:.3f}" for each in point)
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """The end of a message about a misspelt name, ``; did you mean 'x'?``; empty where no known name is like it.
 

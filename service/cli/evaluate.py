@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from service.base.errors import TandemError, one_line
+from service.base.errors import TandemError, in_metres, one_line
 from service.cli.common import (
     SOURCE,
     ActsWithOption,
@@ -44,8 +43,6 @@ GoalsOption = Annotated[
         help="table, air, volume or mixed; or points in metres, such as '0.1,0,0.2; 0,-0.1,0.025'.",
     ),
 ]
-SIZE, CAMERA, SPEED = "1280x720", "front", 1.0
-
 _SIZES = (64, 4096)
 
 
@@ -226,15 +223,15 @@ def render(
     goals: GoalsOption = None,
     seed: _Seed = 0,
     out: Annotated[Path, typer.Option(metavar="FILE", help="Film to write: .mp4 or .gif.")] = Path("video.mp4"),
-    size: Annotated[str, typer.Option(metavar="WxH", help="Of the whole film, pixels.")] = SIZE,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Of the whole film, pixels.")] = "1280x720",
     camera: Annotated[
         str,
         typer.Option(
             metavar="VIEW",
             help="front, far, close, side, behind or top; also, or after it, azimuth=DEG,elevation=DEG,distance=M.",
         ),
-    ] = CAMERA,
-    speed: Annotated[float, typer.Option(help="0.5: half as fast as in the world.", min=0.05, max=20)] = SPEED,
+    ] = "front",
+    speed: Annotated[float, typer.Option(help="0.5: half as fast as in the world.", min=0.05, max=20)] = 1.0,
     primitives: ActsWithOption = None,
     registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
@@ -299,14 +296,10 @@ def parse_goals(text: str, world: WorldConfig) -> GoalKind | StateArray:
             f"--goals {text!r}: write one of {', '.join(GOAL_KINDS)}, or points x,y,z in metres with ; between"
         )
     for point in points[~in_workspace(points, world.workspace)]:
-        low, high = (_numbers(corner) for corner in (world.workspace.lower_m, world.workspace.upper_m))
-        raise TandemError(f"--goals: {_numbers(point)} is outside of the workspace, ({low}) to ({high}) m")
+        low, high = (in_metres(corner) for corner in (world.workspace.lower_m, world.workspace.upper_m))
+        raise TandemError(f"--goals: {in_metres(point)} is outside of the workspace, ({low}) to ({high}) m")
     for point in points[inside_fixtures(points, world)]:
         raise TandemError(
-            f"--goals: at {_numbers(point)} the object would be inside a fixture, or the upright box around it"
+            f"--goals: at {in_metres(point)} the object would be inside a fixture, or the upright box around it"
         )
     return points
-
-
-def _numbers(point: Iterable[float]) -> str:
-    return ", ".join(f"{each:g}" for each in point)

@@ -17,7 +17,7 @@ from service.cli.common import (
     loading,
     print_json,
 )
-from service.cli.evaluate import CAMERA, SIZE, SPEED, GoalsOption, film_options, parse_goals
+from service.cli.evaluate import GoalsOption, parse_goals
 
 _MAX_FILMED = 16
 
@@ -87,18 +87,20 @@ def dataset(
         from service.config.self_play import SelfPlayConfig
         from service.media import recording
         from service.media.dataset import check_name, played_episodes, played_turns, write_dataset
+        from service.media.encoding import check_format
         from service.media.video import write_episode_video, write_video
         from service.registry.loading import load
 
         name = check_name(out)  # now, not after hours of playing
-        options = film_options(SIZE, CAMERA, SPEED, video) if video is not None else None
+        if video is not None:
+            check_format(video)
         trained = load(players, registry).expect("primitives", "orchestrator", by="tandem dataset")
     config = trained.config.model_copy(update={"world": trained.world})
     if trained.alice is not None and isinstance(config, SelfPlayConfig) and goals is None:
         rounds = recording.play_rounds(config, trained.alice, trained.policy, num_rounds=episodes, seed=seed)
         played = played_turns(rounds)
         if video is not None:
-            write_video(rounds[:_MAX_FILMED], config.world, video, options)
+            write_video(rounds[:_MAX_FILMED], config.world, video)
     else:
         asked = None if goals is None else parse_goals(goals, config.world)
         if asked is not None and not isinstance(asked, str):
@@ -106,7 +108,7 @@ def dataset(
         recorded = recording.record_on_goals(trained, episodes, seed, asked)
         played = played_episodes(recorded)
         if video is not None:
-            write_episode_video(recorded.first(_MAX_FILMED), config.world, video, options)
+            write_episode_video(recorded.first(_MAX_FILMED), config.world, video)
     place = write_dataset(name, played, config, trained.label)
     typer.echo(f"{len(played)} episodes, {sum(len(each.actions) for each in played):,} steps: {name} in {place}")
     if video is not None:

@@ -25,6 +25,7 @@ from service.cli.common import (
 
 if TYPE_CHECKING:
     from service.registry.manifest import Manifest
+    from service.registry.names import Version
     from service.registry.registry import Registry
 
 registry_app = typer.Typer(
@@ -85,9 +86,7 @@ def list_versions(directory: RegistryOption = REGISTRY, as_json: JsonOption = Fa
 @registry_app.command()
 def show(reference: _Reference, directory: RegistryOption = REGISTRY, as_json: JsonOption = False) -> None:
     """Show what a version says about itself."""
-    from service.registry.bundled import find_version
-
-    registry, version = find_version(reference, directory)
+    registry, version = _found(reference, directory)
     manifest = registry.manifest(str(version))
     summary = _summary(registry, manifest)
     tree = manifest.model_dump(mode="json")
@@ -111,12 +110,11 @@ def verify(
 ) -> None:
     """Check every byte against its digest, and every parameter; exit code 1 when something is damaged."""
     from service.base.errors import RegistryError
-    from service.registry.bundled import find_version
     from service.registry.loading import network_problems
     from service.registry.registry import Registry
 
     if reference is not None:
-        registry, version = find_version(reference, directory)
+        registry, version = _found(reference, directory)
         problems = registry.verify(str(version), network_problems)
     elif directory.is_dir():
         problems = Registry(directory).verify(check=network_problems)
@@ -136,9 +134,7 @@ def alias(
     directory: RegistryOption = REGISTRY,
 ) -> None:
     """Make or move an alias to a version."""
-    from service.registry.bundled import find_version
-
-    registry, version = find_version(reference, directory)
+    registry, version = _found(reference, directory)
     registry.set_alias(version.name, alias, version.number)
     typer.echo(f"{version.name}@{alias} is now {version}")
 
@@ -150,9 +146,7 @@ def export(
     directory: RegistryOption = REGISTRY,
 ) -> None:
     """Write a version as two files that need no registry; every command takes their directory as a version."""
-    from service.registry.bundled import find_version
-
-    registry, version = find_version(reference, directory)
+    registry, version = _found(reference, directory)
     manifest = registry.export(str(version), target)
     typer.echo(f"{manifest.reference} is in {target}")
 
@@ -168,10 +162,9 @@ def card(
 ) -> None:
     """Write a model card for a hub: what a version is, how it was trained, how good it is, how to load it."""
     from service.base.files import os_errors, write_atomic
-    from service.registry.bundled import find_version
     from service.registry.card import model_card
 
-    registry, version = find_version(reference, directory)
+    registry, version = _found(reference, directory)
     text = model_card(registry.manifest(str(version)), licence=licence)
     if out is None:
         typer.echo(text, nl=False)
@@ -179,6 +172,13 @@ def card(
     with os_errors("write", out):
         write_atomic(out, text.encode())
     typer.echo(f"the card of {version} is in {out}")
+
+
+def _found(reference: str, directory: Path) -> tuple[Registry, Version]:
+    """A version, and the registry that holds it."""
+    from service.registry.bundled import find_version
+
+    return find_version(reference, directory)
 
 
 def _summary(registry: Registry, manifest: Manifest) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.base.errors import TandemError
+from service.base.errors import TandemError, in_metres
 from service.cli.common import CHAMPION, REFERENCE, SOURCE, CommandGroup, SourceOption, print_json
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def run(
         def ready(episode: int, goal_m: StateArray) -> None:
             if written is not None:
                 written.episode = episode
-            wait(f"goal {episode + 1} of {episodes}, {_words(goal_m)}: put arm and object to their start")
+            wait(f"goal {episode + 1} of {episodes}, {in_metres(goal_m)}: put arm and object to their start")
 
         bridge = Bridge(
             player.policy, backend.robot, backend.poses, player.world, config,
@@ -99,7 +99,7 @@ def run(
             outcomes.append(outcome)
             if not as_json:
                 reached = "reached" if outcome.reached else "not reached"
-                typer.echo(f"goal {_words(outcome.goal_m)}: {reached}, {outcome.distance_m:.3f} m away in the end")
+                typer.echo(f"goal {in_metres(outcome.goal_m)}: {reached}, {outcome.distance_m:.3f} m away in the end")
     num_reached = sum(outcome.reached for outcome in outcomes)
     if as_json:
         print_json({"policy": player.label, "robot": described.label, "reached": num_reached, "goals": len(outcomes)})
@@ -205,12 +205,8 @@ def _print_step(row: dict[str, Any], box: Box, *, to_stderr: bool) -> None:
     if "width_m" not in row:
         return
     typer.echo(
-        f"step {row['step']:>3}  gripper {_words(row['effector_m'])}  object {_words(row['object_m'])}"
-        f"  would go to {_words(box.clip(row['target_m']))}"
+        f"step {row['step']:>3}  gripper {in_metres(row['effector_m'])}  object {in_metres(row['object_m'])}"
+        f"  would go to {in_metres(box.clip(row['target_m']))}"
         f"  width {row['width_m']:.3f} m",
         err=to_stderr,
     )
-
-
-def _words(point: StateArray) -> str:
-    return ", ".join(f"{number:.3f}" for number in point)

@@ -40,9 +40,9 @@ def serve(
 ) -> None:
     """Show finished and running runs and the registry over REST, to Prometheus, and to a browser."""
     from service.base.errors import StatusError
+    from service.base.ports import DEFAULT_PORT, free_port
     from service.registry.registry import Registry
     from service.registry.token import VARIABLE, read_token
-    from service.status.ports import DEFAULT_PORT, free_port
     from service.status.run_reader import open_reader
 
     with needs_extra("serve", "tandem serve"):

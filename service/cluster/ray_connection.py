@@ -15,10 +15,10 @@ from typing import Any
 
 from service.base.errors import TandemError, one_line
 from service.base.extras import needs_extra
+from service.base.ports import DEFAULT_PORT
 from service.base.progress import answer, doing
 from service.methods.method import WorkersError
 from service.runs.signals import InterruptError, StopSignals
-from service.status.ports import DEFAULT_PORT
 
 CONNECT_S = 5.0
 _CLUSTERS_VARIABLE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"

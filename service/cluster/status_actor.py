@@ -14,8 +14,8 @@ import ray
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from service.base.errors import StatusError
+from service.base.ports import free_port
 from service.cluster.ray_connection import StatusOptions
-from service.status.ports import free_port
 from service.store.address import RedisAddress
 
 _logger = logging.getLogger(__name__)

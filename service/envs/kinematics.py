@@ -18,8 +18,6 @@ from service.base.types import BoolArray, IntArray, StateArray
 
 Orientation = Literal["down", "down_any_turn", "free"]
 """What a gripper may do with its direction: it points down and does not turn, it points down, or nothing is asked."""
-DOWN = np.diag([1.0, -1.0, -1.0])
-"""Rotation of a gripper that points down: its z axis is down, and its y axis, along which fingers open, is -y."""
 _NUM_ROWS = {"down": 6, "down_any_turn": 5, "free": 3}
 """Rows of the Jacobian that count: the last is the turn about the vertical."""
 _LIMIT_MARGIN = 0.03
@@ -162,7 +160,8 @@ class Chain:
     def errors(self, here: Kinematics, target: StateArray) -> StateArray:
         """(N, E) way to (N, 3) targets, metres, and the turn to the orientation, rad, as far as one is asked."""
         rotation, turn = here.rotation, np.empty((len(target), 3))
-        # Half the sum of the axes' cross products with those of DOWN, written out, as it has only three numbers.
+        # Half the sum of the axes' cross products with those of a gripper that points down, whose y axis, along which
+        # fingers open, is -y: diag(1, -1, -1). Written out, as it has only three numbers.
         turn[:, 0] = 0.5 * (rotation[:, 2, 1] - rotation[:, 1, 2])
         turn[:, 1] = 0.5 * (rotation[:, 2, 0] + rotation[:, 0, 2])
         turn[:, 2] = -0.5 * (rotation[:, 1, 0] + rotation[:, 0, 1])

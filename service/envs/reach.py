@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.base.errors import ConfigError
+from service.base.errors import ConfigError, in_metres
 from service.base.types import BoolArray, StateArray
 from service.config import WorkspaceConfig
 from service.config.robot import RobotConfig
@@ -97,8 +97,8 @@ def _find(robot: RobotConfig, arm: Chain) -> Reach:
     radius = float(np.linalg.norm(home[:2] - axis))
     if radius < _MARGIN_M:
         raise ConfigError(
-            f"robot {robot.name}: at home its end effector is at {_point(home)} m, on the axis of its base: bend the "
-            "arm, so that home is a posture in the middle of its work"
+            f"robot {robot.name}: at home its end effector is at ({in_metres(home)}) m, on the axis of its base: bend "
+            "the arm, so that home is a posture in the middle of its work"
         )
     outward = (home[:2] - axis) / radius
     heights: StateArray = np.linspace(robot.lowest_m, robot.lowest_m + _HEIGHT_M, _NUM_HEIGHTS)
@@ -111,8 +111,8 @@ def _find(robot: RobotConfig, arm: Chain) -> Reach:
     first, last = _run(_arrives(arm, joints, above_home), int(np.argmin(np.abs(heights - home[2]))))
     if first == last:
         raise ConfigError(
-            f"robot {robot.name}: from its home posture the arm does not come to {_point(home)} m with the orientation "
-            f"{robot.orientation!r}: check home, effector and orientation"
+            f"robot {robot.name}: from its home posture the arm does not come to ({in_metres(home)}) m with the "
+            f"orientation {robot.orientation!r}: check home, effector and orientation"
         )
     heights, joints = heights[first:last], joints[first:last]
     ends = []
@@ -142,7 +142,3 @@ def _run(there: BoolArray, around: int) -> tuple[int, int]:
     missing = np.flatnonzero(~there)
     before, after = missing[missing < around], missing[missing > around]
     return int(before[-1]) + 1 if before.size else 0, int(after[0]) if after.size else len(there)
-
-
-def _point(position: StateArray) -> str:
-    return f"({', '.join(f'{each:.2f}' for each in position)})"

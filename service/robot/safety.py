@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 from pydantic import Field
 
-from service.base.errors import ConfigError, RobotError, SafetyStopError
+from service.base.errors import ConfigError, RobotError, SafetyStopError, in_metres
 from service.base.types import StateArray
 from service.config.frozen import FrozenModel
 from service.config.world import Point, WorkspaceConfig
@@ -121,7 +121,9 @@ class SafeRobot:
             )
         inside = self.limiter.box.contains(self.state.effector_m, margin_m=_START_MARGIN_M)
         if not (inside or self._dry_run):
-            self._fail(f"the gripper starts at {_words(self.state.effector_m)}, outside the box {self.limiter.box}")
+            self._fail(
+                f"the gripper starts at ({in_metres(self.state.effector_m)}) m, outside the box {self.limiter.box}"
+            )
         self.limiter.start(self.state.effector_m)
         self._expected_s = self._robot.now_s()
         self._moved_s = self._expected_s - tick_s
@@ -265,7 +267,3 @@ class SafeRobot:
     def _fail(self, reason: str) -> None:
         self.stop(reason)
         self._check_stopped()
-
-
-def _words(point: StateArray) -> str:
-    return "(" + ", ".join(f"{number:.3f}" for number in np.asarray(point)) + ") m"

@@ -15,10 +15,6 @@ _ENDS = ("close", "finish")
 """Names of what ends a tracker, one of which is called where it is there."""
 
 
-Factory = Callable[[str, dict[str, Any]], Any]
-"""Makes an object with ``log(metrics, step)``, the number of env steps, of a run's name and configuration."""
-
-
 class Trackers:
     """The trackers of a run, until ``close``.
 
@@ -68,8 +64,10 @@ class Trackers:
             _logger.warning("tracker %s is left out from now on, the run goes on: %s", reference, _told(error))
 
 
-def find_factory(reference: str) -> Factory:
+def find_factory(reference: str) -> Callable[..., Any]:
     """The factory that ``--tracker`` names.
+
+    It makes an object with ``log(metrics, step)``, the number of env steps, of a run's name and configuration.
 
     Raises:
         TandemError: there is none by that name.
@@ -78,7 +76,7 @@ def find_factory(reference: str) -> Factory:
     before = list(sys.path)
     sys.path.insert(0, "")  # the command, unlike python -m, does not look into the working directory
     try:
-        factory: Factory = getattr(importlib.import_module(module), name)
+        factory: Callable[..., Any] = getattr(importlib.import_module(module), name)
     except Exception as error:  # of the module's own code, too
         raise TandemError(
             f"--tracker {reference!r} cannot be loaded: {_told(error)}; write module:factory, such as my_trackers:wandb"
@@ -88,7 +86,7 @@ def find_factory(reference: str) -> Factory:
     return factory
 
 
-def _make(reference: str, factory: Factory, name: str, config: dict[str, Any]) -> Any:
+def _make(reference: str, factory: Callable[..., Any], name: str, config: dict[str, Any]) -> Any:
     try:
         tracker = factory(name, config)
     except Exception as error:

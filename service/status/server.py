@@ -13,10 +13,10 @@ from pathlib import Path
 import uvicorn
 
 from service.base.errors import StatusError
+from service.base.ports import DEFAULT_PORT, listen
 from service.registry.registry import Registry
 from service.status.app import create_app
 from service.status.auth import is_loopback
-from service.status.ports import DEFAULT_PORT, listen
 from service.store.models import RunReader
 
 START_TIMEOUT_S = 10.0

@@ -352,7 +352,7 @@ def test_render_films_goals_that_are_typed(trained, monkeypatch, tmp_path):
     [
         (["--goals", "lift"], "--goals 'lift': write one of table, air, mixed, volume, or points"),
         (["--goals", "0.1,nan,0.2"], "or points x,y,z in metres"),
-        (["--goals", "0.1,0,0.2;0.9,0,0.1"], "0.9, 0, 0.1 is outside of the workspace"),
+        (["--goals", "0.1,0,0.2;0.9,0,0.1"], "0.900, 0.000, 0.100 is outside of the workspace"),
         (["--size", "641x360"], "--size '641x360': write WIDTHxHEIGHT, even numbers"),
         (["--camera", "moon"], "camera 'moon': there is none"),
         (["--speed", "0"], "'--speed': "),
@@ -368,7 +368,7 @@ def test_a_film_that_cannot_be_made(arguments, part, tmp_path, monkeypatch):
 def test_a_goal_of_a_film_is_in_no_fixture():
     world = WorldConfig(fixtures=[{"shape": "box", "size_m": (0.1, 0.1, 0.1), "position_m": (0.05, 0.05)}])
     assert parse_goals("0.05,0.05,0.2", world).tolist() == [[0.05, 0.05, 0.2]]
-    with pytest.raises(TandemError, match=r"--goals: at 0\.05, 0\.05, 0\.05 the object would be inside a fixture"):
+    with pytest.raises(TandemError, match=r"--goals: at 0\.050, 0\.050, 0\.050 the object would be inside a fixture"):
         parse_goals("0.05,0.05,0.2; 0.05,0.05,0.05", world)
 
 

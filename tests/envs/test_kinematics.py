@@ -6,7 +6,7 @@ import pytest
 
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs.batch import DISPLACEMENT_M
-from service.envs.kinematics import DOWN, Chain
+from service.envs.kinematics import Chain
 from service.envs.panda import JOINT_LOWER, JOINT_UPPER, PANDA
 from service.envs.reach import reach_of
 from service.envs.robot import Robot
@@ -121,7 +121,9 @@ def assert_reached(arm, joints, target, tolerance_m):
     assert np.linalg.norm(found.position - target, axis=1).max() < tolerance_m
     tilt = np.arccos(np.clip(-found.rotation[:, 2, 2], -1.0, 1.0))
     assert np.degrees(tilt.max()) < 0.5
-    np.testing.assert_allclose(found.rotation, np.broadcast_to(DOWN, found.rotation.shape), rtol=0, atol=0.01)
+    np.testing.assert_allclose(
+        found.rotation, np.broadcast_to(np.diag([1.0, -1.0, -1.0]), found.rotation.shape), rtol=0, atol=0.01
+    )
     assert (joints > JOINT_LOWER).all()
     assert (joints < JOINT_UPPER).all()
 

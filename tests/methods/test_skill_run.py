@@ -104,7 +104,8 @@ def published(tmp_path_factory):
     drawn = []
     with pytest.MonkeyPatch.context() as patch:  # a video takes seconds, and OpenGL
         patch.setattr(
-            "service.media.video.write_episode_video", lambda episodes, world, path: drawn.append(episodes) or path
+            "service.media.video.write_episode_video",
+            lambda episodes, world, path, options: drawn.append(episodes) or path,
         )
         done = train(small_config(), run, path / "registry", on_iteration=lambda metrics: None)
     assert str(done.version) == "cube-lsd@1"

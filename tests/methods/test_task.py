@@ -39,7 +39,7 @@ pytestmark = pytest.mark.usefixtures("default_signals", "no_video")
 def no_video():
     """Without a video, which takes seconds, and OpenGL."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("service.media.video.write_episode_video", lambda episodes, world, path: path)
+        patch.setattr("service.media.video.write_episode_video", lambda episodes, world, path, options: path)
         yield
 
 

@@ -102,7 +102,7 @@ def home(tmp_path, monkeypatch):
     monkeypatch.setattr(training, "make_artifacts", lambda directory, registry: {})
     monkeypatch.setattr("service.media.artifacts.NUM_SKILLS", 2)
     monkeypatch.setattr("service.media.artifacts.COVERAGE_STEPS", 2)
-    monkeypatch.setattr("service.media.video.write_video", lambda takes, world, path: path)
+    monkeypatch.setattr("service.media.video.write_video", lambda takes, world, path, options: path)
     home = SimpleNamespace(path=tmp_path / "run", registry=tmp_path / "registry")
     config = write_yaml(tmp_path / "tiny.yaml")
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.status.ports import free_port
+from service.base.ports import free_port
 from tests.status.conftest import serve
 from tests.status.runs import BEARER, CLIENT, TOKEN
 

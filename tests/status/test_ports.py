@@ -6,10 +6,10 @@ from contextlib import contextmanager
 import pytest
 from typer.testing import CliRunner
 
+from service.base.ports import DEFAULT_PORT, free_port
 from service.cli.main import app
 from service.cluster.ray_connection import StatusOptions, parse_status
 from service.cluster.status_actor import place
-from service.status.ports import DEFAULT_PORT, free_port
 
 
 @contextmanager
@@ -25,7 +25,7 @@ def taken(port=0):
 def busy(monkeypatch):
     """The usual port, which is taken."""
     with taken() as port:
-        monkeypatch.setattr("service.status.ports.DEFAULT_PORT", port)
+        monkeypatch.setattr("service.base.ports.DEFAULT_PORT", port)
         yield port
 
 

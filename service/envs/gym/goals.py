@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from service.base.errors import TandemError
+from service.base.errors import TandemError, in_metres
 from service.base.types import Array, BoolArray, StateArray
 from service.config import WorldConfig
 from service.envs.reach import Reach
@@ -89,8 +89,8 @@ class GoalSource:
         self._check_reach("reset: options['goal']", goal)
         for bad in goal[inside_fixtures(goal, self._config)]:
             raise TandemError(
-                f"reset: options['goal'] {_point(bad)} m: the object would be inside a fixture, or the upright box "
-                "around it"
+                f"reset: options['goal'] ({in_metres(bad)}) m: the object would be inside a fixture, or the upright "
+                "box around it"
             )
         return goal
 
@@ -118,8 +118,8 @@ class GoalSource:
 
     def _check_reach(self, what: str, goal: StateArray) -> None:
         for bad in goal[self._out_of_reach(goal)]:
-            near = _point(self._nearest(bad[None])[0])
-            raise TandemError(f"{what} {_point(bad)} m is out of reach: the nearest the arm comes is {near} m")
+            near = in_metres(self._nearest(bad[None])[0])
+            raise TandemError(f"{what} ({in_metres(bad)}) m is out of reach: the nearest the arm comes is ({near}) m")
 
     def _nearest(self, goal: StateArray) -> StateArray:
         """(N, 3) where the object can be brought, nearest to (N, 3); on the table it may be lower than the arm."""
@@ -131,7 +131,3 @@ class GoalSource:
     def _out_of_reach(self, goal: StateArray) -> BoolArray:
         near: BoolArray = np.linalg.norm(self._nearest(goal) - goal, axis=1) <= self._success_distance_m
         return ~near  # what is no number is out of reach, too
-
-
-def _point(position: StateArray) -> str:
-    return f"({', '.join(f'{each:.3g}' for each in position)})"

@@ -5,16 +5,14 @@ The loop steps the game and tells the browsers; it waits for the clock alone, an
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import logging
-import socket
 import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from service.base import ports
 from service.base.errors import TandemError
 from service.base.extras import needs_extra
 from service.registry.loading import Trained
@@ -22,8 +20,6 @@ from service.robot.play.game import Game
 from service.robot.play.page import LiveScene, Panel
 
 PORT = 8322
-_NUM_PORTS = 50
-"""That are tried after the usual one."""
 _FRAME_S = 1 / 30
 _MOST_STEPS = 4
 """In one frame: a machine that is too slow shows a slower world, and does not fall behind for ever."""
@@ -145,13 +141,12 @@ def free_port(host: str, port: int | None) -> int:
 
     ``viser`` itself would silently take another one, and wait for ever where a host is not here.
     """
-    for candidate in [port] if port is not None else range(PORT, PORT + _NUM_PORTS):
-        try:
-            with contextlib.closing(socket.create_server((host, candidate), reuse_port=False)) as found:
-                return int(found.getsockname()[1])
-        except OSError as error:
-            if port is None and error.errno == errno.EADDRINUSE:
-                continue
-            reason = f"cannot listen on {host}:{candidate}: {error.strerror}"
-            raise TandemError(f"{reason}; take another --port or leave it out, and check --host") from None
-    raise TandemError(f"ports {PORT} to {PORT + _NUM_PORTS - 1} are all taken; name a free one with --port")
+    try:
+        chosen = ports.free_port(host, PORT) if port is None else port
+        with ports.listen(host, chosen) as found:
+            return int(found.getsockname()[1])
+    except OSError as error:
+        where = f"{host}:{PORT if port is None else port}"
+        raise TandemError(
+            f"cannot listen on {where}: {error.strerror}; take another --port or leave it out, and check --host"
+        ) from None

@@ -63,9 +63,12 @@ def test_many_worlds_have_one_goal_or_one_each(envs):
     ("options", "said"),
     [
         ({"goal": (0.0, 0.1)}, r"options\['goal'\] has shape \(2,\), not \(3,\) or \(2, 3\)"),
-        ({"goal": (0.0, np.nan, 0.1)}, r"\(0, nan, 0.1\) m is out of reach"),
-        ({"goal": [GOAL, (0.9, 0.0, 0.1)]}, r"\(0.9, 0, 0.1\) m is out of reach: the nearest the arm comes is \(0.\d"),
-        ({"goal": (0.0, 0.0, -0.1)}, r"the nearest the arm comes is \(0, 0, 0.025\) m"),
+        ({"goal": (0.0, np.nan, 0.1)}, r"\(0.000, nan, 0.100\) m is out of reach"),
+        (
+            {"goal": [GOAL, (0.9, 0.0, 0.1)]},
+            r"\(0.900, 0.000, 0.100\) m is out of reach: the nearest the arm comes is \(0.\d",
+        ),
+        ({"goal": (0.0, 0.0, -0.1)}, r"the nearest the arm comes is \(0.000, 0.000, 0.025\) m"),
         ({"goal": (0.0, 0.0, 3.0)}, "out of reach"),
         ({"gaol": GOAL}, "unknown option 'gaol'"),
     ],
@@ -158,7 +161,7 @@ def test_goals_in_a_box_are_in_it_and_clear_of_what_stands_there():
         (((0.0, 0.0), (0.1, 0.1)), "choose one of table, air, mixed, volume, a function"),
         (7, "choose one of table"),
         (((0.1, 0.0, 0.1), (0.0, 0.1, 0.2)), "the first corner of a box is the lowest"),
-        (((0.0, 0.0, 0.1), (0.9, 0.1, 0.2)), r"the box's corner \(0.9, 0, 0.1\) m is out of reach"),
+        (((0.0, 0.0, 0.1), (0.9, 0.1, 0.2)), r"the box's corner \(0.900, 0.000, 0.100\) m is out of reach"),
         (((0.0, 0.0, np.inf), (0.9, 0.1, np.inf)), "is out of reach"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Where the status service listens: a port, or the next free one where several services run on one machine."""
+"""Where services listen: at a port, or at the next free one where several run on one machine."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import errno
 import socket
 
 DEFAULT_PORT = 8321
+"""Of the status service."""
 MAX_TRIED = 50
 
 
