@@ -46,7 +46,6 @@ AUTO, EXACTLY = "auto", "exactly"
 """Values of ``--resume``; the second where it is typed alone."""
 _OF_RAY, _OF_A_RUN_ON_RAY = ("address", "status", "token_file"), ("num_actors", "actor_threads", "learner_cpus")
 """Options that mean nothing in one process."""
-_WHERE = {"table": "on the table", "air": "in the air"}
 
 
 class TrainCommand(TyperCommand):
@@ -246,7 +245,10 @@ def demo(
     overrides = [f"run.total_env_steps={env_steps}", "name=panda-cube-demo", "run.evaluation_interval=25"]
     config = load_config(recipes()[DEFAULT_RECIPE], overrides)
     done = _train(config, RunDirectory(path), path / "registry", resume=False)
-    rates = {where: done.metrics.get(f"evaluation/{name}_success_last") for name, where in _WHERE.items()}
+    rates = {
+        where: done.metrics.get(f"evaluation/{name}_success_last")
+        for name, where in (("table", "on the table"), ("air", "in the air"))
+    }
     told = [f"{rate:.0%} of random goals {where}" for where, rate in rates.items() if rate is not None]
     reaches = f", and now reaches {' and '.join(told)}" if told else ""
     typer.echo(f"\nBob has practised for {done.num_env_steps:,} steps{reaches}.")
