@@ -103,7 +103,7 @@ def test_records_after_the_checkpoint_may_be_anything(run):
     """They are made again."""
     with (run / "metrics.jsonl").open("ab") as file:
         file.write(b'{"iteration": 99, "env_steps": 5}\n{"iteration": 100, "env_st')
-    assert go_on(run).reason == "finished"
+    assert go_on(run) == "finished"
 
 
 def test_a_checkpoint_of_another_run_is_refused(run, tmp_path):
@@ -138,7 +138,7 @@ def test_a_configuration_that_may_change_is_said_and_noted(run, caplog):
 
 
 def test_a_run_may_be_moved(run, tmp_path):
-    assert go_on(run.rename(tmp_path / "elsewhere")).reason == "finished"
+    assert go_on(run.rename(tmp_path / "elsewhere")) == "finished"
 
 
 @pytest.mark.parametrize("version", ["0.1.0", "0.2.0", "0.4.1"])
