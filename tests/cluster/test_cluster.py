@@ -259,7 +259,8 @@ def test_workers_that_hang_are_replaced_and_one_that_is_late_is_not(tmp_path, mo
         for name in set(frozen) & set(played):
             if workers_of(run)[name].incarnation == 0:
                 method = run.method
-                on_the_way = len(method._pending) + len(method._current.batch)
+                batch = method._current.batch if method._current is not None else ()
+                on_the_way = len(method._pending) + len(batch)
                 played[name].append((run.iteration, on_the_way, len(method._pool.rounds)))
 
     run, result = run_cluster(tmp_path, story=freeze, on_beat=look)
