@@ -20,7 +20,7 @@ LEARNING_RATE_BOUNDS = 0.03, 2.0
 
 
 class LearnerError(TandemError):
-    """A device that is not there, nothing to learn from, or states that do not fit; the message says what to do."""
+    """A device that is not there, or nothing to learn from; the message says what to do."""
 
 
 class Player:
@@ -45,23 +45,8 @@ class Player:
         arrays: Arrays = {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.tensors().items()}
         return arrays | {"learning_rate": np.array(self.optimizer.learning_rate)}
 
-    def check_state(self, state: Mapping[str, Array], *, where: str) -> None:
-        """Compare names and shapes of a state's arrays with this player's; ``where`` names the player in errors.
-
-        Raises:
-            LearnerError: they differ; names the first array that does.
-        """
-        actual = {name: array.shape for name, array in state.items()}
-        expected = {name: tuple(tensor.shape) for name, tensor in self.tensors().items()} | {"learning_rate": ()}
-        for name in sorted(actual.keys() | expected.keys()):
-            found, wanted = actual.get(name, "none"), expected.get(name, "none")
-            if found != wanted:
-                raise LearnerError(
-                    f"learner state {where}/{name}: expected {wanted}, got {found}; use the configuration of that run"
-                )
-
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Continue exactly where ``state``, which fits, was taken.
+        """Continue exactly where ``state`` was taken, by a player of the same configuration.
 
         Where a lower or higher learning rate is configured by now, the saved one is moved within its bounds.
         """

@@ -223,32 +223,6 @@ def test_rollouts_not_learned_from_are_not_part_of_a_state():
     assert resumed.ingest(rollout)
 
 
-@pytest.mark.parametrize(
-    "name", ["rng", "bob/policy/gate.output.weight", "demonstrations/action", "alice/learning_rate"]
-)
-def test_a_state_with_a_missing_array_is_refused(name):
-    learner = Learner(make_config())
-    state = learner.state()
-    before = save(state)
-    damaged = {key: array for key, array in state.items() if key != name}
-    with pytest.raises(LearnerError, match=name):
-        learner.load_state(damaged)
-    assert save(learner.state()) == before
-
-
-def test_a_state_of_other_networks_is_refused_as_a_whole():
-    learner, other = Learner(make_config()), Learner(make_config())
-    updated(other, 0)
-    state = other.state()
-    name = "bob/policy/gate.output.bias"
-    before = save(learner.state())
-    with pytest.raises(LearnerError, match=rf"{name}.*\(2,\).*\(5,\)"):
-        learner.load_state(state | {name: np.zeros(5, dtype=np.float32)})
-    with pytest.raises(LearnerError, match="carol"):
-        learner.load_state(state | {"carol/policy": np.zeros(1)})
-    assert save(learner.state()) == before
-
-
 def test_demonstrations_of_the_last_iterations_are_kept():
     learner = Learner(make_config(**HISTORY))
     counts = []
