@@ -12,7 +12,7 @@ from service.base.errors import TandemError
 from service.base.types import Array, Arrays
 from service.config.self_play import PPOConfig
 from service.policies import gaussian
-from service.policies.adam import Adam
+from service.policies.adam import Adam, copied, put_back
 
 ADAM_EPSILON = 1e-5
 LEARNING_RATE_BOUNDS = 0.03, 2.0
@@ -42,17 +42,14 @@ class Player:
 
     def state(self) -> Arrays:
         """Copy everything that changes: parameters, Adam's state, learning rate."""
-        arrays: Arrays = {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.tensors().items()}
-        return arrays | {"learning_rate": np.array(self.optimizer.learning_rate)}
+        return copied(self.tensors()) | {"learning_rate": np.array(self.optimizer.learning_rate)}
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue exactly where ``state`` was taken, by a player of the same configuration.
 
         Where a lower or higher learning rate is configured by now, the saved one is moved within its bounds.
         """
-        with torch.no_grad():
-            for name, tensor in self.tensors().items():
-                tensor.copy_(torch.from_numpy(np.array(state[name])))
+        put_back(state, self.tensors())
         low, high = (self.config.learning_rate * bound for bound in LEARNING_RATE_BOUNDS)
         self.optimizer.learning_rate = min(max(float(state["learning_rate"]), low), high)
 

@@ -16,9 +16,9 @@ from torch.nn.utils.parametrizations import spectral_norm
 
 from service.base.types import Array, Arrays, FloatArray
 from service.config.skills import SkillMethod, SkillsConfig
-from service.learner.sac import ADAM_EPSILON, copied, put_back
+from service.learner.sac import ADAM_EPSILON
 from service.learner.sac_networks import make_layers
-from service.policies.adam import Adam
+from service.policies.adam import Adam, copied, put_back
 
 _CLIP = 50.0
 """Of the difference of two log-probabilities of DADS (its code)."""
@@ -72,11 +72,12 @@ class IntrinsicReward:
 
     def state(self) -> Arrays:
         """Everything that ``load_state`` continues from, copied."""
-        return copied(self._tensors(), self._random)
+        return copied(self._tensors()) | {"random": self._random.get_state().numpy().copy()}
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue, bit for bit, where ``state`` was taken by a reward of the same settings."""
-        put_back(state, self._tensors(), self._random)
+        put_back(state, self._tensors())
+        self._random.set_state(torch.from_numpy(np.array(state["random"])))
 
     def _make_network(self) -> nn.Module:
         return make_layers(self.state_size, *self.config.hidden_sizes, self.config.size)
