@@ -156,11 +156,6 @@ class ActorPool:
         return [*starting, *rounds, *(each for slot in self for each in slot.evaluations)]
 
     @property
-    def num_alive(self) -> int:
-        """Actors that have started."""
-        return sum(slot.alive for slot in self)
-
-    @property
     def num_counted_on(self) -> int:
         """Actors that have started, or may any moment, and are not late; at least 1: so many rollouts of an update."""
         return max(1, sum(not (slot.late or slot.waits) for slot in self))

@@ -134,7 +134,7 @@ class LearnerActor(Watched):
             Where it is, and its weights and state before the next update.
 
         Raises:
-            LearnerError: a device is not there.
+            ConfigError: a device is not there.
         """
         from service.learner.learner import Learner  # torch, which no other worker needs
 

@@ -343,7 +343,7 @@ class RaySelfPlay(SelfPlay):
             recorded,
             learned,
             elapsed_s=elapsed_s,
-            num_alive=self._pool.num_alive,
+            num_alive=sum(slot.alive for slot in self._pool),
             hand_over_s=float(np.mean([each.hand_over_s for each in iteration.batch])),
         )
         evaluated, self._evaluated = self._evaluated, {}

@@ -11,13 +11,14 @@ import torch
 from numpy.typing import NDArray
 
 from service.actors.rollout import MAX_POLICY_LAG, Demonstrations, Rollout, Turns, Weights
+from service.base.errors import ConfigError
 from service.base.tensors import join_parts, split_parts
 from service.base.types import Array, Arrays, Metrics
 from service.config.self_play import SelfPlayConfig
 from service.envs.observations import Layouts, layouts
 from service.learner import ppo, transfer
 from service.learner.diagnostics import composition_metrics, probes
-from service.learner.player import LearnerError, Player
+from service.learner.player import Player
 from service.learner.samples import (
     DemonstrationHistory,
     DemonstrationRows,
@@ -44,7 +45,7 @@ class Learner:
         """Make both players from ``config.seed``; this is version 0.
 
         Raises:
-            LearnerError: CUDA is asked for and not there.
+            ConfigError: CUDA is asked for and not there.
         """
         torch.set_num_threads(config.learner.num_threads)
         self.config = config
@@ -94,14 +95,10 @@ class Learner:
 
         Returns:
             Metrics named ``learner/...``; one that could not be measured is left out.
-
-        Raises:
-            LearnerError: there are none.
         """
         start = time.perf_counter()
         rollouts = [self._pending[key] for key in sorted(self._pending)]
-        if not rollouts:
-            raise LearnerError("learner update with 0 rollouts: ingest at least one first")
+        assert rollouts, "ingest at least one first"
         metrics = self._update_alice(rollouts)
         for name, value in self._update_bob(rollouts).items():
             metrics[name] = metrics.get(name, 0.0) + value  # only counts of failures are both players'
@@ -267,10 +264,10 @@ def torch_device(name: str) -> torch.device:
     """The device that ``learner.device`` names.
 
     Raises:
-        LearnerError: it is not there.
+        ConfigError: it is not there.
     """
     if name == "cuda" and not torch.cuda.is_available():
-        raise LearnerError("learner.device = 'cuda': torch finds no CUDA device here; set learner.device=cpu")
+        raise ConfigError("learner.device = 'cuda': torch finds no CUDA device here; set learner.device=cpu")
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     return torch.device(name)

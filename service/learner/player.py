@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from service.base.errors import TandemError
 from service.base.types import Array, Arrays
 from service.config.self_play import PPOConfig
 from service.policies import gaussian
@@ -17,10 +16,6 @@ from service.policies.adam import Adam, copied, put_back
 ADAM_EPSILON = 1e-5
 LEARNING_RATE_BOUNDS = 0.03, 2.0
 """The KL-adaptive learning rate stays within these multiples of the configured one."""
-
-
-class LearnerError(TandemError):
-    """A device that is not there, or nothing to learn from; the message says what to do."""
 
 
 class Player:

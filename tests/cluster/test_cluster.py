@@ -16,6 +16,7 @@ from ray.exceptions import ObjectLostError
 from torch import cuda
 
 from benchmarks.processes import descendants
+from service.base.errors import ConfigError
 from service.cluster import actor_pool, self_play, watch
 from service.cluster.ray_actors import NICENESS
 from service.cluster.ray_connection import ClusterOptions, connected, explaining_ray_errors
@@ -24,7 +25,6 @@ from service.cluster.remote_worker import RemoteWorker
 from service.cluster.self_play import RaySelfPlay, num_gpus
 from service.cluster.watch import RayletWatch
 from service.cluster.worker_variables import WORKER_VARIABLES
-from service.learner.player import LearnerError
 from service.methods.method import StateLostError, WorkersError
 from service.policies.parameters import PolicyError
 from service.runs.run import Run
@@ -371,7 +371,7 @@ def test_a_learner_that_cannot_start_is_one_line(monkeypatch):
     monkeypatch.setattr(self_play, "num_gpus", lambda device: 0)  # Ray would wait for one
     learner = tiny_config().learner.model_copy(update={"device": "cuda"})
     method = RaySelfPlay(tiny_config().model_copy(update={"learner": learner}), ClusterOptions(num_actors=1))
-    with pytest.raises(LearnerError) as error, explaining_ray_errors():
+    with pytest.raises(ConfigError) as error, explaining_ray_errors():
         method.start()
     method.close()
     assert_one_line(error.value, "learner.device", "no CUDA device", "learner.device=cpu")

@@ -5,10 +5,10 @@ import pytest
 import torch
 from safetensors.numpy import load, save
 
+from service.base.errors import ConfigError
 from service.envs.observations import ACTION, BOB
 from service.learner import ppo
 from service.learner.learner import Learner, _rng_from_array, _rng_to_array, paid_well, torch_device
-from service.learner.player import LearnerError
 from tests.learner.rollouts import make_config, make_rollout, nobody_learns
 
 IMITATION = {"weight": 0.5, "num_iterations": 2, "min_reward": 0.5}
@@ -155,10 +155,10 @@ def test_the_order_of_arrival_does_not_matter():
 
 def test_an_update_needs_a_rollout():
     learner = Learner(make_config())
-    with pytest.raises(LearnerError, match="ingest"):
+    with pytest.raises(AssertionError, match="ingest"):
         learner.update()
     updated(learner, 0)
-    with pytest.raises(LearnerError, match="ingest"):
+    with pytest.raises(AssertionError, match="ingest"):
         learner.update()
 
 
@@ -339,7 +339,7 @@ def test_a_broken_turn_leaves_the_player_as_it_was():
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="asking for CUDA is no mistake on a machine that has it")
 def test_cuda_that_is_not_there_is_the_users_mistake():
-    with pytest.raises(LearnerError, match=r"learner\.device=cpu"):
+    with pytest.raises(ConfigError, match=r"learner\.device=cpu"):
         Learner(make_config(device="cuda"))
 
 
