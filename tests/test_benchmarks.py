@@ -36,28 +36,6 @@ from tests.runs.runs import tiny_config
 
 ROOT = Path(__file__).parents[1]
 
-TINY = [
-    "game.num_worlds=6",
-    "game.alice_steps=4",
-    "game.bob_steps=5",
-    "game.success_distance_m=0.0005",
-    "policy.alice.hidden_sizes=[8]",
-    "policy.value.hidden_sizes=[8]",
-    "policy.bob.trunk_hidden_sizes=[8]",
-    "policy.bob.primitive_hidden_size=8",
-    "policy.bob.gate_hidden_sizes=[8]",
-    "generator.opponent_interval=1",
-    "run.num_threads=1",
-    "run.evaluation_interval=0",
-    "run.total_env_steps=1000000",
-]
-
-
-@pytest.fixture
-def config():
-    return load_config(None, TINY)
-
-
 # --- measuring --------------------------------------------------------------------------------------------------------
 
 
@@ -173,8 +151,7 @@ def test_the_first_of_three_in_a_row():
 
 def test_a_seed_ends_when_it_is_there(tmp_path, monkeypatch):
     monkeypatch.setattr(time_to_skill, "SHARE", 0.0)
-    evaluated = [f"run.evaluation_{name}" for name in ("interval=1", "episodes=2", "steps=2")]
-    (tmp_path / "tiny.yaml").write_text(dump_config(load_config(None, [*TINY, *evaluated])))
+    (tmp_path / "tiny.yaml").write_text(dump_config(tiny_config(evaluation_interval=1)))
     run = time_to_skill.run_seed(tmp_path / "tiny.yaml", [], 3, 1_000_000)
     assert (run["seed"], run["reached"], run["at"]) == (3, True, run["curve"][0])
     assert len(run["curve"]) >= 3
@@ -326,7 +303,8 @@ def test_stages_are_the_nearest_snapshots():
     assert record_run.pick_stages([60]) == {"end": 60}
 
 
-def test_coverage_is_measured_at_each_stage_beside_a_random_policy(config):
+def test_coverage_is_measured_at_each_stage_beside_a_random_policy():
+    config = load_config()
     untrained, other = (Learner(config.model_copy(update={"seed": seed})).weights().bob for seed in (0, 1))
     _, champion = Registry(BUNDLED).load("panda-cube@champion")
     bobs = {0: untrained, 500: champion, 900: other}
@@ -348,7 +326,7 @@ def test_coverage_is_measured_at_each_stage_beside_a_random_policy(config):
 
 
 def test_a_monolithic_bob_has_no_coverage():
-    config = load_config(None, [*TINY, "policy.monolithic_bob={hidden_sizes: [8]}"])
+    config = load_config(None, ["policy.monolithic_bob={hidden_sizes: [8]}"])
     assert record_run.measure_coverage({5: Learner(config).weights().bob}, config, num_sets=1, num_steps=1) is None
 
 

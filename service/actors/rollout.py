@@ -1,4 +1,4 @@
-"""Rollouts: one round of self-play on N worlds, as plain arrays.
+"""Rollouts: one round of self-play on N worlds, as plain arrays; and the weights that it is played with.
 
 Shapes: T steps of a turn (time first), N worlds, D demonstration steps. Network inputs and outputs are float32, physics
 states float64.
@@ -16,6 +16,19 @@ from service.generator.records import GoalRecords
 
 Diverged = tuple[tuple[StateArray, FloatArray], ...]
 """(last finite state (S,), action (4,)) of each world whose physics diverged."""
+MAX_POLICY_LAG = 2
+"""Policy versions between the one that acted and the one that learns from it, at most; 1 where all are equally fast."""
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """Parameters of both players, of one policy version."""
+
+    version: int
+    alice: dict[str, FloatArray]
+    bob: dict[str, FloatArray]
+    bob_ema: dict[str, FloatArray]
+    """Moving average of Bob's parameters, to be evaluated and published; see ``learner.bob_ema_decay``."""
 
 
 @dataclass(frozen=True, slots=True)

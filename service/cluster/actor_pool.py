@@ -13,7 +13,7 @@ import ray
 
 from service.base.types import Metrics
 from service.cluster.iteration import Round
-from service.cluster.ray_actors import Location, RolloutActor, remote_actor
+from service.cluster.ray_actors import RolloutActor, remote_actor
 from service.cluster.watch import Clock, Watch
 from service.config.self_play import SelfPlayConfig
 from service.envs.sampling import GoalKind
@@ -32,8 +32,6 @@ class ActorSlot:
     """A place in the pool, and one incarnation of the actor that has it."""
 
     index: int
-    incarnation: int
-    handle: Any
     starting: Any
     """Reference to its location, which comes when it has started; None from then on."""
     watch: Watch
@@ -42,8 +40,6 @@ class ActorSlot:
     num_rollouts: int = 0
     num_env_steps: int = 0
     last_error: str | None = None
-    location: Location | None = None
-    """None until it has started."""
     round: Round | None = None
     """The round it plays."""
     rounds_s: deque[float] = field(default_factory=lambda: deque(maxlen=10))
@@ -56,7 +52,7 @@ class ActorSlot:
     @property
     def alive(self) -> bool:
         """Whether it has started."""
-        return self.location is not None
+        return self.watch.location is not None
 
     @property
     def waits(self) -> bool:
@@ -72,7 +68,7 @@ class ActorSlot:
 
     def start_round(self, version: int, weights: Any, snapshot: Any, opponents: Any, num_rounds: int) -> None:
         """Give it a round, which takes references; see ``RolloutWorker.play``."""
-        references = self.handle.play_round.remote(weights, snapshot, opponents, num_rounds)
+        references = self.watch.handle.play_round.remote(weights, snapshot, opponents, num_rounds)
         self.round = Round(version, weights, *references)
         self.watch.begin()
 
@@ -95,7 +91,7 @@ class ActorSlot:
 
     def start_evaluation(self, weights: Any, kind: GoalKind) -> None:
         """Ask it to evaluate Bob, which it does before the next round."""
-        self.evaluations.append(self.handle.evaluate.remote(weights, [kind]))
+        self.evaluations.append(self.watch.handle.evaluate.remote(weights, [kind]))
         self.watch.begin()
 
     def finish_evaluation(self, reference: Any) -> Metrics:
@@ -121,8 +117,7 @@ class ActorSlot:
     def status(self) -> ActorStatus:
         """The slot's state for the status service."""
         counted = {"num_rollouts": self.num_rollouts, "num_env_steps": self.num_env_steps}
-        name = f"rollout-{self.index}"
-        return self.watch.status(name, self.incarnation, self.location, self.last_error, **counted)
+        return self.watch.status(self.last_error, **counted)
 
 
 class ActorPool:
@@ -161,11 +156,6 @@ class ActorPool:
         return [*starting, *rounds, *(each for slot in self for each in slot.evaluations)]
 
     @property
-    def num_alive(self) -> int:
-        """Actors that have started."""
-        return sum(slot.alive for slot in self)
-
-    @property
     def num_counted_on(self) -> int:
         """Actors that have started, or may any moment, and are not late; at least 1: so many rollouts of an update."""
         return max(1, sum(not (slot.late or slot.waits) for slot in self))
@@ -179,13 +169,13 @@ class ActorPool:
         """Have ``num`` slots: new ones get an actor, and of too many those go that wait for a core."""
         for index in sorted(self._slots, reverse=True):
             if len(self._slots) > num and not self._slots[index].alive:
-                ray.kill(self._slots.pop(index).handle)
+                ray.kill(self._slots.pop(index).watch.handle)
         free = [index for index in range(num) if index not in self._slots]
         self._slots |= {index: self._spawn(index) for index in free[: max(0, num - len(self._slots))]}
 
     def replace(self, slot: ActorSlot, reason: str) -> None:
         """Kill a slot's actor and spawn the next incarnation."""
-        ray.kill(slot.handle)
+        ray.kill(slot.watch.handle)
         new = self._spawn(slot.index)
         new.num_rollouts, new.num_env_steps, new.last_error = slot.num_rollouts, slot.num_env_steps, reason
         if not slot.alive:
@@ -195,12 +185,11 @@ class ActorPool:
     def close(self) -> None:
         """Kill all actors."""
         for slot in self:
-            ray.kill(slot.handle)
+            ray.kill(slot.watch.handle)
         self._slots.clear()
 
     def _spawn(self, index: int) -> ActorSlot:
         incarnation = self._incarnations[index]
         self._incarnations[index] = incarnation + 1
         handle = self._actor.remote(self.config, index, incarnation, self._num_threads)
-        watch = Watch(handle.progress.remote, self._clock)
-        return ActorSlot(index, incarnation, handle, handle.ping.remote(), watch)
+        return ActorSlot(index, handle.ping.remote(), Watch(f"rollout-{index}", incarnation, handle, self._clock))

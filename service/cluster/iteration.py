@@ -8,8 +8,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+from service.actors.rollout import MAX_POLICY_LAG
 from service.base.types import Metrics
-from service.learner.weights import MAX_POLICY_LAG
 from service.methods.method import Iteration
 from service.methods.workers import RoundSummary
 from service.store.models import GoalGrid

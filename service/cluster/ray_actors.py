@@ -16,7 +16,7 @@ import ray
 from ray.util.metrics import Counter, Histogram
 
 import service.cluster.worker_variables  # noqa: F401  before NumPy and MuJoCo are imported  # isort: split
-from service.actors.rollout import Rollout
+from service.actors.rollout import Rollout, Weights
 from service.base.liveness import count_work, work_done
 from service.base.types import Arrays, Metrics
 from service.config.self_play import SelfPlayConfig
@@ -29,7 +29,6 @@ from service.store.models import GoalGrid
 
 if TYPE_CHECKING:
     from service.learner.learner import Learner
-    from service.learner.weights import Weights
 
 NICENESS = 10
 """Of workers that compute all the time, above that of processes that answer: driver, status service, Redis, Ray itself.
@@ -98,7 +97,7 @@ class GeneratorActor(GeneratorWorker, Watched):
         (state,) = _fetch(references)
         if state is not None:
             self.generator.load_state(state)
-        return self.ping(), self.generator.state(), self.generator.snapshot(), self.opponents()
+        return self.ping(), self.generator.state(), self.generator.snapshot(), self.generator.opponents
 
     @ray.method(num_returns=4)
     def record_from(
@@ -110,9 +109,9 @@ class GeneratorActor(GeneratorWorker, Watched):
             Its part of the iteration with the goal grid after it, whether the run should stop and whether there are
             other past players; the generator's whole state, a snapshot for the next rounds, and those past players.
         """
-        before = self.opponents().version
+        before = self.generator.opponents.version
         recorded = self.record(iteration, weights, _fetch(references))
-        opponents = self.opponents()
+        opponents = self.generator.opponents
         has_new = opponents.version != before
         answer = recorded, self.grid(iteration + 1, num_env_steps), self.generator.should_stop(), has_new
         return answer, self.generator.state(), self.generator.snapshot(), opponents if has_new else None
@@ -135,7 +134,7 @@ class LearnerActor(Watched):
             Where it is, and its weights and state before the next update.
 
         Raises:
-            LearnerError: the state does not fit, or a device is not there.
+            ConfigError: a device is not there.
         """
         from service.learner.learner import Learner  # torch, which no other worker needs
 

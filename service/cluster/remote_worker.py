@@ -10,8 +10,6 @@ from typing import Any
 import ray
 from ray.exceptions import ObjectLostError, RayActorError, RayError, RayTaskError
 
-from service.base.errors import TandemError
-from service.cluster.ray_actors import Location
 from service.cluster.ray_connection import last_line
 from service.cluster.watch import Clock, Watch
 from service.methods.method import StateLostError, WorkersError
@@ -51,11 +49,9 @@ class RemoteWorker:
         """Reference to the answer that it owes; None where it owes none."""
         self.made: list[Any] = []
         """References to what it has made at its start, or makes with its answer."""
-        self.incarnation = -1
         self._last_error: str | None = None
         self._hung: str | None = None
-        self._location: Location | None = None
-        self._spawn()
+        self._spawn(0)
 
     def start(self, retried: tuple[type[Exception], ...] = (RayActorError,)) -> None:
         """Wait until it has started, and has its state.
@@ -71,7 +67,7 @@ class RemoteWorker:
             if attempt:
                 self.close()
                 time.sleep(BACK_OFF_S * 2 ** (attempt - 1))
-                self._spawn()
+                self._spawn(self.watch.incarnation + 1)
             try:
                 self._wait_until_ready()
                 return
@@ -92,17 +88,17 @@ class RemoteWorker:
         self._last_error = reason = self._hung or last_line(error)
         _logger.warning("the %s is gone (%s); another goes on from its last state", self.name, reason)
         self.close()
-        self._spawn()
+        self._spawn(self.watch.incarnation + 1)
         try:
             self.start((RayActorError, WorkersError))
         except (RayError, WorkersError) as failed:
             raise StateLostError(f"the {self.name} cannot go on from its last state ({last_line(failed)})") from None
-        _logger.info("the %s is back, as its incarnation %d", self.name, self.incarnation)
+        _logger.info("the %s is back, as its incarnation %d", self.name, self.watch.incarnation)
         return reason
 
     def ask(self, call: str, *arguments: Any) -> None:
         """Ask it to do something; its ``answer`` comes when it is done."""
-        self.answer, *self.made = getattr(self._handle, call).remote(*arguments)
+        self.answer, *self.made = getattr(self.watch.handle, call).remote(*arguments)
         self.watch.begin()
 
     def take_answer(self) -> Any:
@@ -124,27 +120,25 @@ class RemoteWorker:
 
     def close(self) -> None:
         """Kill it."""
-        ray.kill(self._handle, no_restart=True)
+        ray.kill(self.watch.handle, no_restart=True)
 
     def status(self) -> ActorStatus:
         """Its state for the status service."""
-        return self.watch.status(self.name, self.incarnation, self._location, self._last_error)
+        return self.watch.status(self._last_error)
 
-    def _spawn(self) -> None:
+    def _spawn(self, incarnation: int) -> None:
         """Make its next process, which need not be up."""
-        self.incarnation += 1
-        self._handle = self._actor.remote(self._config)
-        self.watch = Watch(self._handle.progress.remote, self._clock)
-        self._hung = self._location = None
+        self.watch = Watch(self.name, incarnation, self._actor.remote(self._config), self._clock)
+        self._hung = None
 
     def _wait_until_ready(self) -> None:
         """Wait until it has its state.
 
         Raises:
-            WorkersError: it has not in time, or cannot.
-            RayError: it died.
+            WorkersError: it has not in time.
+            RayError: it died, or cannot.
         """
-        answer, *self.made = self._handle.start.remote([self.state])
+        answer, *self.made = self.watch.handle.start.remote([self.state])
         clock = Clock()
         while not ray.wait([answer], timeout=POLL_S)[0]:
             clock.look()
@@ -154,12 +148,7 @@ class RemoteWorker:
                     "one what it asks for (a GPU, with learner.device=cuda)? see ray status"
                 )
             self._on_wait()
-        try:
-            self._location, *_ = ray.get([answer, *self.made])  # all: Ray prints errors that were not asked for
-        except RayTaskError as error:
-            if isinstance(error.cause, TandemError):  # for people; where it was raised is not
-                raise WorkersError(str(error.cause)) from None
-            raise
+        self.watch.location, *_ = ray.get([answer, *self.made])  # all: Ray prints errors that were not asked for
 
 
 def lost(error: BaseException) -> bool:

@@ -31,7 +31,7 @@ import ray
 from ray.exceptions import ObjectLostError, RayError, RayTaskError
 
 from service.actors.evaluation import EVALUATED_GOALS
-from service.actors.rollout import from_arrays
+from service.actors.rollout import MAX_POLICY_LAG, from_arrays
 from service.base.errors import DivergedError
 from service.base.types import Metrics
 from service.cluster.actor_pool import ActorPool, ActorSlot
@@ -41,7 +41,6 @@ from service.cluster.ray_connection import ClusterOptions, last_line
 from service.cluster.remote_worker import POLL_S, RemoteWorker, lost
 from service.cluster.watch import Clock, RayletWatch
 from service.config.self_play import SelfPlayConfig
-from service.learner.weights import MAX_POLICY_LAG
 from service.methods.method import Health, Iteration, State, StateLostError, WorkersError
 from service.methods.self_play import LocalSelfPlay, SelfPlay
 from service.policies.parameters import Parameters, PolicyError
@@ -161,7 +160,7 @@ class RaySelfPlay(SelfPlay):
         lack: list[str] = []
         if waiting := sum(slot.waits for slot in self._pool):
             lack.append(f"{waiting} of {len(self._pool)} rollout actors wait for a free core")
-        if late := ", ".join(f"rollout-{slot.index}" for slot in self._pool if slot.late):
+        if late := ", ".join(slot.watch.name for slot in self._pool if slot.late):
             lack.append(f"{late}: late; updates go on without")
         actors = (*(slot.status() for slot in self._pool), self._learner.status(), self._generator.status())
         return Health(actors, self._num_counted, self._num_refused, tuple(lack), self._last_error)
@@ -224,9 +223,9 @@ class RaySelfPlay(SelfPlay):
         """Take what an actor has answered; one that has failed is replaced, and the round it played is lost."""
         try:
             if slot.starting in ready:
-                slot.location, slot.starting = ray.get(slot.starting), None
-                if slot.incarnation > 0:
-                    _logger.info("rollout actor %d is back, as its incarnation %d", slot.index, slot.incarnation)
+                slot.watch.location, slot.starting = ray.get(slot.starting), None
+                if slot.watch.incarnation > 0:
+                    _logger.info("rollout actor %d is back, as its incarnation %d", slot.index, slot.watch.incarnation)
             for reference in ready.intersection(slot.evaluations):
                 self._evaluated |= slot.finish_evaluation(reference)
             if slot.round is not None and slot.round.answer in ready:
@@ -247,7 +246,7 @@ class RaySelfPlay(SelfPlay):
 
     def _replace(self, slot: ActorSlot, reason: str) -> None:
         _logger.warning("rollout actor %d is gone (%s); another takes its place", slot.index, reason)
-        self._last_error = f"rollout-{slot.index}: {reason}"
+        self._last_error = f"{slot.watch.name}: {reason}"
         self._pool.replace(slot, reason)
 
     # --- iterations ------------------------------------------------------------------------------------------------
@@ -331,7 +330,7 @@ class RaySelfPlay(SelfPlay):
         assert iteration.updated is not None
         assert iteration.recorded is not None
         learned, taken = iteration.updated
-        recorded, self._grid, self._converged, has_new_opponents = iteration.recorded
+        recorded, self._grid, self.converged, has_new_opponents = iteration.recorded
         now = time.monotonic()
         elapsed_s, self._last_iteration = now - self._last_iteration, now
         self._version = int(learned["learner/version"])
@@ -344,7 +343,7 @@ class RaySelfPlay(SelfPlay):
             recorded,
             learned,
             elapsed_s=elapsed_s,
-            num_alive=self._pool.num_alive,
+            num_alive=sum(slot.alive for slot in self._pool),
             hand_over_s=float(np.mean([each.hand_over_s for each in iteration.batch])),
         )
         evaluated, self._evaluated = self._evaluated, {}

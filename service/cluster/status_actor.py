@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,15 +12,12 @@ from typing import Any
 import ray
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from service.base.errors import StatusError
 from service.base.ports import free_port
 from service.cluster.ray_connection import StatusOptions
 from service.store.address import RedisAddress
 
 _logger = logging.getLogger(__name__)
 START_S = 60.0
-REBIND_S = 10.0
-"""A restarted service waits so long for its port, which the one that died had a moment ago."""
 
 
 class StatusWorker:
@@ -37,13 +33,10 @@ class StatusWorker:
     def __init__(self, options: StatusOptions, runs_dir: Path, registry: Path, redis: RedisAddress | None) -> None:
         self._options, self._runs_dir, self._registry, self._redis = options, runs_dir, registry, redis
         if ray.get_runtime_context().was_current_actor_reconstructed:  # it is not asked a second time
-            self.start(patience_s=REBIND_S)
+            self.start()
 
-    def start(self, patience_s: float = 0.0) -> str:
+    def start(self) -> str:
         """Serve from now on.
-
-        Args:
-            patience_s: how long a port may be taken.
 
         Returns:
             Where the driver's machine reaches the service.
@@ -58,15 +51,7 @@ class StatusWorker:
         reader, options = open_reader(self._runs_dir, self._redis), self._options
         registry = Registry(self._registry)
         place: dict[str, Any] = {"host": options.host, "port": options.port, "runs_dir": self._runs_dir}
-        deadline_s = time.monotonic() + patience_s
-        while True:
-            try:
-                self._server = StatusServer(reader, registry, token=options.token, **place)
-                break
-            except StatusError:
-                if time.monotonic() >= deadline_s:
-                    raise
-                time.sleep(0.1)
+        self._server = StatusServer(reader, registry, token=options.token, **place)
         self._server.start()
         return self._server.url
 

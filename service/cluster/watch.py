@@ -59,12 +59,16 @@ class Watch:
     """One process of a worker, from its start to its end.
 
     Args:
-        probe: asks it for ``liveness.work_done``, in a thread beside the one that works; returns a reference.
+        name: of the worker, for people.
+        incarnation: which of its processes this is, counted from 0.
+        handle: Ray's of the process. It answers ``progress`` in a thread beside the one that works.
         clock: of the driver.
     """
 
-    def __init__(self, probe: Callable[[], Any], clock: Clock) -> None:
-        self._probe, self._clock = probe, clock
+    def __init__(self, name: str, incarnation: int, handle: Any, clock: Clock) -> None:
+        self.name, self.incarnation, self.handle, self._clock = name, incarnation, handle, clock
+        self.location: Location | None = None
+        """None until it has started."""
         self._num_calls = 0
         self._bound_s = FIRST_S
         self.heartbeat = datetime.now(UTC)
@@ -73,17 +77,15 @@ class Watch:
         self._asked: Any = None
         self._count: int | None = None
 
-    def status(
-        self, name: str, incarnation: int, location: Location | None, last_error: str | None, **counted: int
-    ) -> ActorStatus:
-        """The worker's state for the status service; it has no location while it starts."""
+    def status(self, last_error: str | None, **counted: int) -> ActorStatus:
+        """The worker's state for the status service; ``last_error`` is why its last process ended."""
         return ActorStatus(
-            name=name,
-            incarnation=incarnation,
-            state="starting" if location is None else "alive",
+            name=self.name,
+            incarnation=self.incarnation,
+            state="starting" if self.location is None else "alive",
             last_error=last_error,
             heartbeat=self.heartbeat,
-            **(location or {}),
+            **(self.location or {}),
             **counted,
         )
 
@@ -127,7 +129,7 @@ class Watch:
                 return
             if count != self._count:
                 self._count, self._moved, self.heartbeat = count, self._clock.now, datetime.now(UTC)
-        self._asked = self._probe()
+        self._asked = self.handle.progress.remote()
 
 
 class RayletWatch:

@@ -59,8 +59,8 @@ class StopCriterion:
 class TaskGenerator:
     """What became of a run's goals, its past opponents, and the stop criterion.
 
-    In call order: ``record``, ``add_opponents`` if ``opponents_due``, ``snapshot``, ``should_stop``; one ``record`` is
-    one iteration. Nothing here is random.
+    In call order: ``record``, ``add_opponents``, ``snapshot``, ``should_stop``; one ``record`` is one iteration.
+    Nothing here is random.
     """
 
     def __init__(self, config: SelfPlayConfig, layout: StateLayout) -> None:
@@ -146,14 +146,15 @@ class TaskGenerator:
         }
         return {name: value for name, value in metrics.items() if not np.isnan(value)}
 
-    def opponents_due(self, iteration: int) -> bool:
-        """Whether the players of this iteration, counted from 0, join the pool; the untrained ones never do."""
-        return iteration > 0 and iteration % self._config.generator.opponent_interval == 0
-
     def add_opponents(self, iteration: int, alice: Mapping[str, Array], bob: Mapping[str, Array]) -> None:
-        """Add the parameters of this iteration's players to the past ones, of which the oldest may go."""
-        # The number of the iteration is a version that is the same whichever process records it.
-        self.opponents = self.opponents.joined_by(alice, bob, iteration, self._config.generator.opponent_pool_size)
+        """Add the parameters of some iterations' players to the past ones, of which the oldest may go.
+
+        Iterations are counted from 0; the untrained players of the first never join.
+        """
+        config = self._config.generator
+        if iteration > 0 and iteration % config.opponent_interval == 0:
+            # The number of the iteration is a version that is the same whichever process records it.
+            self.opponents = self.opponents.joined_by(alice, bob, iteration, config.opponent_pool_size)
 
     def should_stop(self) -> bool:
         """Whether, over ``novelty_window`` iterations, Alice found no new goal cell and Bob solved her goals."""

@@ -13,7 +13,7 @@ from service.actors.distillation import Lesson
 from service.base.types import Array, Arrays, FloatArray, Metrics
 from service.config.distillation import DistillationConfig
 from service.policies import networks
-from service.policies.adam import Adam
+from service.policies.adam import Adam, copied, put_back
 from service.policies.forward import compose
 
 _ADAM_EPSILON = 1e-8
@@ -97,13 +97,11 @@ class Distiller:
 
     def state(self) -> Arrays:
         """Everything that ``load_state`` continues from, copied."""
-        return {name: tensor.detach().numpy().copy() for name, tensor in self._tensors().items()}
+        return copied(self._tensors())
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue, bit for bit, where ``state`` was taken."""
-        with torch.no_grad():
-            for name, tensor in self._tensors().items():
-                tensor.copy_(torch.from_numpy(np.array(state[name])))
+        put_back(state, self._tensors())
 
     def _tensors(self) -> dict[str, Tensor]:
         parts: dict[str, Mapping[str, Tensor]] = {"student": self._parameters, "average": self._average}

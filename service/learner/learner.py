@@ -10,21 +10,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from service.actors.rollout import Demonstrations, Rollout, Turns
+from service.actors.rollout import MAX_POLICY_LAG, Demonstrations, Rollout, Turns, Weights
+from service.base.errors import ConfigError
 from service.base.tensors import join_parts, split_parts
 from service.base.types import Array, Arrays, Metrics
 from service.config.self_play import SelfPlayConfig
 from service.envs.observations import Layouts, layouts
 from service.learner import ppo, transfer
 from service.learner.diagnostics import composition_metrics, probes
-from service.learner.player import LearnerError, Player
+from service.learner.player import Player
 from service.learner.samples import (
     DemonstrationHistory,
     DemonstrationRows,
     Samples,
     reflect_at_random,
 )
-from service.learner.weights import MAX_POLICY_LAG, Weights
 from service.policies import networks
 
 DEMONSTRATIONS, IMITATED = "demonstrations", "imitated"
@@ -45,7 +45,7 @@ class Learner:
         """Make both players from ``config.seed``; this is version 0.
 
         Raises:
-            LearnerError: CUDA is asked for and not there.
+            ConfigError: CUDA is asked for and not there.
         """
         torch.set_num_threads(config.learner.num_threads)
         self.config = config
@@ -56,8 +56,9 @@ class Learner:
         self._device = torch_device(config.learner.device)
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(config.seed)
-            alice = networks.make_alice(config.policy, seen), networks.make_alice_value(config.policy, seen)
-            bob = networks.make_bob(config.policy, seen), networks.make_bob_value(config.policy, seen)
+            value = config.policy.value
+            alice = networks.make_alice(config.policy, seen), networks.ValueNetwork(seen.full.normalisation, value)
+            bob = networks.make_bob(config.policy, seen), networks.ValueNetwork(seen.bob_value.normalisation, value)
         if config.learner.bfloat16:
             for network in (*alice, *bob):
                 networks.use_bfloat16(network)
@@ -94,14 +95,10 @@ class Learner:
 
         Returns:
             Metrics named ``learner/...``; one that could not be measured is left out.
-
-        Raises:
-            LearnerError: there are none.
         """
         start = time.perf_counter()
         rollouts = [self._pending[key] for key in sorted(self._pending)]
-        if not rollouts:
-            raise LearnerError("learner update with 0 rollouts: ingest at least one first")
+        assert rollouts, "ingest at least one first"
         metrics = self._update_alice(rollouts)
         for name, value in self._update_bob(rollouts).items():
             metrics[name] = metrics.get(name, 0.0) + value  # only counts of failures are both players'
@@ -158,26 +155,16 @@ class Learner:
         }
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Continue exactly where ``state`` was taken, by a learner of the same configuration.
-
-        Raises:
-            LearnerError: an array is missing, left over or does not fit; the learner is as it was then.
-        """
-        state = dict(state)
-        try:
-            own = {name: state.pop(name) for name in ("version", "rng", "counted")}
-            bob_ema = {name: np.array(state.pop(f"{_BOB_EMA}/{name}")) for name in self._bob_ema}
-            arrays = "observation", "action", "num_steps"
-            histories = {key: {name: state.pop(f"{key}/{name}") for name in arrays} for key in self._histories}
-        except KeyError as error:
-            raise LearnerError(f"learner state: no array {error}; take an undamaged checkpoint") from None
-        self._load_players(split_parts(state))
-        self._bob_ema = bob_ema
-        self.version = int(own["version"])
-        self._rng = _rng_from_array(own["rng"])
-        self._counted = {(int(actor), int(incarnation)): int(last) for actor, incarnation, last in own["counted"]}
-        for name, history in histories.items():
-            self._histories[name].load_state(history)
+        """Continue exactly where ``state`` was taken, by a learner of the same configuration."""
+        parts = split_parts(state)
+        self._alice.load_state(parts["alice"])
+        self._bob.load_state(parts["bob"])
+        self._bob_ema = {name: np.array(parts[_BOB_EMA][name]) for name in self._bob_ema}
+        self.version = int(state["version"])
+        self._rng = _rng_from_array(state["rng"])
+        self._counted = {(int(actor), int(incarnation)): int(last) for actor, incarnation, last in state["counted"]}
+        for name, history in self._histories.items():
+            history.load_state(parts[name])
         self._pending.clear()
 
     def _average_bob(self) -> None:
@@ -190,15 +177,6 @@ class Learner:
         keep = min(decay, (1 + self.version) / (8 + self.version))
         old = self._bob_ema if keep > 0.0 else new
         self._bob_ema = {name: np.asarray(each + np.float32(keep) * (old[name] - each)) for name, each in new.items()}
-
-    def _load_players(self, states: Mapping[str, Arrays]) -> None:
-        players = {"alice": self._alice, "bob": self._bob}
-        if unknown := sorted(states.keys() - players.keys()):
-            raise LearnerError(f"learner state {unknown[0]!r}: no such part; take a checkpoint of this format version")
-        for key, player in players.items():
-            player.check_state(states.get(key, {}), where=key)
-        for key, player in players.items():
-            player.load_state(states[key])
 
     def _update_alice(self, rollouts: Sequence[Rollout]) -> Metrics:
         samples = ppo.collect([rollout.alice for rollout in rollouts], self._alice)
@@ -286,10 +264,10 @@ def torch_device(name: str) -> torch.device:
     """The device that ``learner.device`` names.
 
     Raises:
-        LearnerError: it is not there.
+        ConfigError: it is not there.
     """
     if name == "cuda" and not torch.cuda.is_available():
-        raise LearnerError("learner.device = 'cuda': torch finds no CUDA device here; set learner.device=cpu")
+        raise ConfigError("learner.device = 'cuda': torch finds no CUDA device here; set learner.device=cpu")
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     return torch.device(name)

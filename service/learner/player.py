@@ -8,19 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from service.base.errors import TandemError
 from service.base.types import Array, Arrays
 from service.config.self_play import PPOConfig
 from service.policies import gaussian
-from service.policies.adam import Adam
+from service.policies.adam import Adam, copied, put_back
 
 ADAM_EPSILON = 1e-5
 LEARNING_RATE_BOUNDS = 0.03, 2.0
 """The KL-adaptive learning rate stays within these multiples of the configured one."""
-
-
-class LearnerError(TandemError):
-    """A device that is not there, nothing to learn from, or states that do not fit; the message says what to do."""
 
 
 class Player:
@@ -42,32 +37,14 @@ class Player:
 
     def state(self) -> Arrays:
         """Copy everything that changes: parameters, Adam's state, learning rate."""
-        arrays: Arrays = {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.tensors().items()}
-        return arrays | {"learning_rate": np.array(self.optimizer.learning_rate)}
-
-    def check_state(self, state: Mapping[str, Array], *, where: str) -> None:
-        """Compare names and shapes of a state's arrays with this player's; ``where`` names the player in errors.
-
-        Raises:
-            LearnerError: they differ; names the first array that does.
-        """
-        actual = {name: array.shape for name, array in state.items()}
-        expected = {name: tuple(tensor.shape) for name, tensor in self.tensors().items()} | {"learning_rate": ()}
-        for name in sorted(actual.keys() | expected.keys()):
-            found, wanted = actual.get(name, "none"), expected.get(name, "none")
-            if found != wanted:
-                raise LearnerError(
-                    f"learner state {where}/{name}: expected {wanted}, got {found}; use the configuration of that run"
-                )
+        return copied(self.tensors()) | {"learning_rate": np.array(self.optimizer.learning_rate)}
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Continue exactly where ``state``, which fits, was taken.
+        """Continue exactly where ``state`` was taken, by a player of the same configuration.
 
         Where a lower or higher learning rate is configured by now, the saved one is moved within its bounds.
         """
-        with torch.no_grad():
-            for name, tensor in self.tensors().items():
-                tensor.copy_(torch.from_numpy(np.array(state[name])))
+        put_back(state, self.tensors())
         low, high = (self.config.learning_rate * bound for bound in LEARNING_RATE_BOUNDS)
         self.optimizer.learning_rate = min(max(float(state["learning_rate"]), low), high)
 

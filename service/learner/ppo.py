@@ -165,7 +165,8 @@ def update(
     metrics["policy_steps"] = float(max(len(stats.scalars.get(name, ())) for name in ("policy_loss", "cloning_loss")))
     if stats.cloned is not None:
         metrics |= cloning_metrics(player, stats.cloned)
-    return metrics | stats.means() | {"kl": kl}
+    means = {name: float(torch.stack(values).mean()) for name, values in stats.scalars.items()}
+    return metrics | means | {"kl": kl}
 
 
 @dataclass(slots=True)
@@ -192,15 +193,6 @@ class UpdateStats:
         if math.isfinite(kl):
             self.kls.append(kl)
         return bool(self.kls) and sum(self.kls) / len(self.kls) > bound
-
-    def add(self, scalars: Scalars) -> None:
-        """Count a minibatch that was learned from."""
-        for name, value in scalars.items():
-            self.scalars[name].append(value.detach())
-
-    def means(self) -> Metrics:
-        """Average each scalar over the minibatches."""
-        return {name: float(torch.stack(values).mean()) for name, values in self.scalars.items()}
 
 
 def train(
@@ -260,7 +252,10 @@ def _step(
         stats.num_non_finite += 1
         return
     player.optimizer.step()
-    stats.add(scalars if stats.stopped else scalars | {"grad_norm": norm})
+    if not stats.stopped:
+        scalars["grad_norm"] = norm
+    for name, value in scalars.items():
+        stats.scalars[name].append(value.detach())
 
 
 def _policy_loss(

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from service.base.types import Array, Arrays, FloatArray, Metrics
 from service.config.skills import SACConfig
 from service.learner.sac_networks import Critics, sample_actions
-from service.policies.adam import Adam
+from service.policies.adam import Adam, copied, put_back
 from service.policies.networks import export_parameters
 
 ADAM_EPSILON = 1e-8
@@ -108,11 +108,12 @@ class SACLearner:
 
     def state(self) -> Arrays:
         """Everything that ``load_state`` continues from, copied."""
-        return copied(self._tensors(), self._random)
+        return copied(self._tensors()) | {"random": self._random.get_state().numpy().copy()}
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue, bit for bit, where ``state`` was taken by a learner of the same settings."""
-        put_back(state, self._tensors(), self._random)
+        put_back(state, self._tensors())
+        self._random.set_state(torch.from_numpy(np.array(state["random"])))
 
     def _tensors(self) -> dict[str, Tensor]:
         """All that changes but the random numbers, by name: the tensors themselves."""
@@ -153,17 +154,3 @@ class SACLearner:
 
     def _noise(self, like: Tensor) -> Tensor:
         return torch.randn(like.shape, generator=self._random)
-
-
-def copied(tensors: Mapping[str, Tensor], random: torch.Generator) -> Arrays:
-    """Tensors by name and the random generator's state, as arrays for a checkpoint."""
-    arrays: Arrays = {name: tensor.detach().numpy().copy() for name, tensor in tensors.items()}
-    return arrays | {"random": random.get_state().numpy().copy()}
-
-
-def put_back(state: Mapping[str, Array], tensors: Mapping[str, Tensor], random: torch.Generator) -> None:
-    """Write what ``copied`` gave into the tensors and the generator."""
-    with torch.no_grad():
-        for name, tensor in tensors.items():
-            tensor.copy_(torch.from_numpy(np.array(state[name])))
-    random.set_state(torch.from_numpy(np.array(state["random"])))

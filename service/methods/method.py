@@ -101,14 +101,11 @@ class Method(ABC):
         """Finished iterations."""
         self.num_env_steps = 0
         """Env steps of all finished iterations."""
+        self.converged = False
+        """Whether there is nothing more to learn; the run then ends before its budget is spent."""
         self.timing = Timing()
         self.on_wait: Callable[[], None] = lambda: None
         """Called about every second while ``step`` or ``start`` wait for another process."""
-
-    @property
-    def converged(self) -> bool:
-        """Whether there is nothing more to learn; the run then ends before its budget is spent."""
-        return False
 
     @property
     def remedy(self) -> str:

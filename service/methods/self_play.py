@@ -41,12 +41,6 @@ class SelfPlay(Method):
     def __init__(self, config: SelfPlayConfig) -> None:
         super().__init__()
         self.config = config
-        self._converged = False
-
-    @property
-    def converged(self) -> bool:
-        """Whether the paper's stop criterion holds: no new goals, and Bob solves what is proposed."""
-        return self._converged
 
     @property
     def remedy(self) -> str:
@@ -115,7 +109,7 @@ class LocalSelfPlay(SelfPlay):
         self._actor = RolloutWorker(config, num_threads=config.run.num_threads)
         self._generator = GeneratorWorker(config)
         self.game, self.generator = self._actor.game, self._generator.generator
-        self._snapshot, self._opponents = self.generator.snapshot(), self._generator.opponents()
+        self._snapshot, self._opponents = self.generator.snapshot(), self.generator.opponents
         self._played = self.learner.weights()
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
         if start_from is not None:
@@ -127,7 +121,7 @@ class LocalSelfPlay(SelfPlay):
         with self.timing("weights"):
             weights, snapshot, opponents = self.learner.weights(), self._snapshot, self._opponents
             # For the next round, and as old as its weights will be.
-            self._snapshot, self._opponents = self.generator.snapshot(), self._generator.opponents()
+            self._snapshot, self._opponents = self.generator.snapshot(), self.generator.opponents
         learning = None
         if self._pending is not None:
             self.learner.ingest(self._pending)
@@ -136,7 +130,7 @@ class LocalSelfPlay(SelfPlay):
             rollout, goals, summary = self._actor.play(weights, snapshot, opponents)
         with self.timing("generator"):
             recorded = self._generator.record(self.iteration, weights, [goals])
-            self._converged = self.generator.should_stop()
+            self.converged = self.generator.should_stop()
         learned: Metrics = {}
         with self.timing("wait for learner"):
             if learning is not None:
@@ -177,7 +171,7 @@ class LocalSelfPlay(SelfPlay):
             "alice": weights.alice,  # for readers without torch: evaluate, render, coverage
             "bob": weights.bob_ema,
         }
-        if self._opponents.version != self._generator.opponents().version:
+        if self._opponents.version != self.generator.opponents.version:
             num = {"num": np.array(len(self._opponents.alice))}  # so that there is a part where there are none, too
             parts["opponents"] = self._opponents.state() | num
         if self._pending is not None:
@@ -192,7 +186,7 @@ class LocalSelfPlay(SelfPlay):
         """Continue from a state of this process or of a cluster."""
         self.learner.load_state(state["learner"])
         self.generator.load_state(state["generator"])
-        self._snapshot, self._opponents = self.generator.snapshot(), self._generator.opponents()
+        self._snapshot, self._opponents = self.generator.snapshot(), self.generator.opponents
         if "snapshot" in state:  # a cluster's has none
             self._snapshot = self._snapshot.with_state(state["snapshot"])
         if "opponents" in state:

@@ -122,11 +122,8 @@ class IntrinsicBatches:
         return Batch(seen.inputs, rows["action"], np.float32(self._config.reward_scale) * paid, seen.next_inputs)
 
 
-def make_skill_loop(config: SkillDiscoveryConfig) -> OffPolicyLoop:
-    """Make the worlds, the networks and the loop of a skill-discovery run; ``loop.worlds`` has to be closed.
-
-    ``loop.make_batch`` is its ``IntrinsicBatches``.
-    """
+def make_skill_loop(config: SkillDiscoveryConfig) -> tuple[OffPolicyLoop, SkillWorlds, IntrinsicBatches]:
+    """Make the loop of a skill-discovery run, its worlds, which have to be closed, and what makes its batches."""
     skills = config.skills
     seeds = [int(seed) for seed in np.random.SeedSequence(config.seed).generate_state(5) >> 1]
     reward = make_reward(skills, STATE_SIZE, seeds[0])
@@ -145,8 +142,8 @@ def make_skill_loop(config: SkillDiscoveryConfig) -> OffPolicyLoop:
     columns = {**_COLUMNS, "skill": skills.size, "action": num_actions}
     num_steps = -(-min(skills.replay_steps, config.run.total_env_steps) // skills.sac.num_worlds)
     replay = ReplayBuffer(num_steps, skills.sac.num_worlds, columns)
-    see = functools.partial(see_object, workspace=config.world.workspace)
-    return OffPolicyLoop(worlds, replay, learner, IntrinsicBatches(reward, skills, see), seeds[4])
+    batches = IntrinsicBatches(reward, skills, functools.partial(see_object, workspace=config.world.workspace))
+    return OffPolicyLoop(worlds, replay, learner, batches, seeds[4]), worlds, batches
 
 
 def see_object(rows: Columns, workspace: WorkspaceConfig) -> Seen:

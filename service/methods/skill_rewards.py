@@ -7,7 +7,6 @@ and the skill z (B, Z) that acted. ``learn`` improves the network, ``rewards`` s
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 
 import numpy as np
@@ -17,9 +16,9 @@ from torch.nn.utils.parametrizations import spectral_norm
 
 from service.base.types import Array, Arrays, FloatArray
 from service.config.skills import SkillMethod, SkillsConfig
-from service.learner.sac import ADAM_EPSILON, copied, put_back
+from service.learner.sac import ADAM_EPSILON
 from service.learner.sac_networks import make_layers
-from service.policies.adam import Adam
+from service.policies.adam import Adam, copied, put_back
 
 _CLIP = 50.0
 """Of the difference of two log-probabilities of DADS (its code)."""
@@ -27,7 +26,7 @@ _MOMENT_DECAY = 0.99
 """Weight that a batch's moments keep from one update to the next, in DADS' normalisation."""
 
 
-class IntrinsicReward(ABC):
+class IntrinsicReward:
     """A reward that a network makes out of transitions and skills.
 
     Args:
@@ -73,11 +72,12 @@ class IntrinsicReward(ABC):
 
     def state(self) -> Arrays:
         """Everything that ``load_state`` continues from, copied."""
-        return copied(self._tensors(), self._random)
+        return copied(self._tensors()) | {"random": self._random.get_state().numpy().copy()}
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue, bit for bit, where ``state`` was taken by a reward of the same settings."""
-        put_back(state, self._tensors(), self._random)
+        put_back(state, self._tensors())
+        self._random.set_state(torch.from_numpy(np.array(state["random"])))
 
     def _make_network(self) -> nn.Module:
         return make_layers(self.state_size, *self.config.hidden_sizes, self.config.size)
@@ -85,8 +85,9 @@ class IntrinsicReward(ABC):
     def _loss(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
         return -self._rewards(before, after, skill).mean()
 
-    @abstractmethod
-    def _rewards(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor: ...
+    def _rewards(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
+        """The way in phi along the skill, as LSD and METRA pay it."""
+        return _along(self.network(after) - self.network(before), skill)
 
     def _learned(self) -> dict[str, Tensor]:
         return dict(self.network.named_parameters())
@@ -109,9 +110,6 @@ class LSD(IntrinsicReward):
                 spectral_norm(layer)
         return network
 
-    def _rewards(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
-        return _along(self.network(after) - self.network(before), skill)
-
 
 class METRA(IntrinsicReward):
     """As LSD with z on the unit sphere, where a step in phi has a mean square of at most 1 (Park et al. 2024).
@@ -129,9 +127,6 @@ class METRA(IntrinsicReward):
         # One gradient step for both: phi goes up on rewards and on room, the dual down where there is room.
         ascent = _along(step, skill) + self._log_dual.exp().detach() * room
         return -ascent.mean() + self._log_dual * room.detach().mean()
-
-    def _rewards(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
-        return _along(self.network(after) - self.network(before), skill)
 
     def _learned(self) -> dict[str, Tensor]:
         return super()._learned() | {"log_dual": self._log_dual}

@@ -17,7 +17,7 @@ from service.base.types import Metrics
 from service.config.skills import SkillDiscoveryConfig
 from service.generator.bins import CELL_SIZE_M, GoalCells, in_air
 from service.methods.method import Iteration, Method, State, goal_grid
-from service.methods.skill_learning import IntrinsicBatches, SkillWorlds, make_skill_loop
+from service.methods.skill_learning import make_skill_loop
 from service.policies.frozen_skills import FrozenSkills, export_skills
 from service.policies.parameters import Parameters
 from service.registry.loading import Trained
@@ -35,10 +35,7 @@ class SkillDiscovery(Method):
     def __init__(self, config: SkillDiscoveryConfig) -> None:
         super().__init__()
         self._config, self._skills = config, config.skills
-        self._loop = make_skill_loop(config)
-        assert isinstance(self._loop.worlds, SkillWorlds)
-        assert isinstance(self._loop.make_batch, IntrinsicBatches)
-        self._worlds, self._batches = self._loop.worlds, self._loop.make_batch
+        self._loop, self._worlds, self._batches = make_skill_loop(config)
         self._cells = GoalCells(config.world, CELL_SIZE_M)
         self._visits = np.zeros(len(self._cells), dtype=np.int64)  # ends of episodes that moved the object
 

@@ -10,12 +10,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from service.actors.evaluation import EVALUATION_SEED, success_metrics
-from service.actors.rollout import Diverged, Rollout
+from service.actors.rollout import Diverged, Rollout, Weights
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
 from service.base.types import Metrics
 from service.config.self_play import SelfPlayConfig
@@ -29,9 +28,6 @@ from service.generator.snapshot import GeneratorSnapshot
 from service.methods.method import Iteration, goal_grid
 from service.policies.numpy_policy import NumpyGaussianPolicy, numpy_bob
 from service.store.models import GoalGrid
-
-if TYPE_CHECKING:
-    from service.learner.weights import Weights
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,10 +141,6 @@ class GeneratorWorker:
         layout = build_layout(config.world, blocked_fraction=config.game.blocked_gripper_fraction)
         self.generator = TaskGenerator(config, layout)
 
-    def opponents(self) -> Opponents:
-        """Past players for the next rounds."""
-        return self.generator.opponents
-
     def record(self, iteration: int, weights: Weights, goals: Sequence[GoalSummary]) -> Iteration:
         """Learn from what became of an iteration's goals.
 
@@ -162,8 +154,7 @@ class GeneratorWorker:
         """
         joined = join_summaries(goals)
         metrics = self.generator.record(joined)
-        if self.generator.opponents_due(iteration):
-            self.generator.add_opponents(iteration, weights.alice, weights.bob)
+        self.generator.add_opponents(iteration, weights.alice, weights.bob)
         return Iteration(metrics, joined.shown)
 
     def grid(self, iteration: int, num_env_steps: int) -> GoalGrid:

@@ -1,12 +1,15 @@
-"""Adam on torch's fused kernel, whose state can be saved at any time."""
+"""Adam on torch's fused kernel, whose state can be saved at any time, and tensors as arrays of a checkpoint."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.optim.adam import adam
+
+from service.base.types import Array, Arrays
 
 
 class Adam:
@@ -51,3 +54,15 @@ class Adam:
     def tensors(self) -> dict[str, Tensor]:
         """Moments and step counts by name: the tensors themselves."""
         return {f"{part}/{name}": tensor for part, tensors in self._state.items() for name, tensor in tensors.items()}
+
+
+def copied(tensors: Mapping[str, Tensor]) -> Arrays:
+    """Tensors by name as arrays for a checkpoint."""
+    return {name: tensor.detach().cpu().numpy().copy() for name, tensor in tensors.items()}
+
+
+def put_back(state: Mapping[str, Array], tensors: Mapping[str, Tensor]) -> None:
+    """Write what ``copied`` gave into the tensors."""
+    with torch.no_grad():
+        for name, tensor in tensors.items():
+            tensor.copy_(torch.from_numpy(np.array(state[name])))

@@ -261,16 +261,6 @@ def make_bob(config: PolicyConfig, layouts: Layouts = PAPER) -> MCPPolicy | Gaus
     )
 
 
-def make_alice_value(config: PolicyConfig, layouts: Layouts = PAPER) -> ValueNetwork:
-    """A new value network for Alice; draws from torch's global generator."""
-    return ValueNetwork(layouts.full.normalisation, config.value)
-
-
-def make_bob_value(config: PolicyConfig, layouts: Layouts = PAPER) -> ValueNetwork:
-    """A new value network for Bob; draws from torch's global generator."""
-    return ValueNetwork(layouts.bob_value.normalisation, config.value)
-
-
 def export_parameters(module: nn.Module) -> dict[str, FloatArray]:
     """Parameters and buffers by their state-dict names, as float32 copies: all that a NumPy policy needs."""
     return {name: tensor.detach().cpu().numpy().astype(np.float32) for name, tensor in module.state_dict().items()}

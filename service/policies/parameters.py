@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -102,24 +102,18 @@ def shape_of(parameters: Parameters, name: str, num_axes: int) -> tuple[int, ...
     return shape
 
 
-def misfits(parameters: Parameters, expected: Shapes) -> Iterator[str]:
-    """Tell of each parameter that is missing, of another shape, or not expected."""
-    for name in [*expected, *(name for name in parameters if name not in expected)]:
-        if name not in parameters:
-            yield f"policy parameter {name!r} is missing, expected shape {expected[name]}"
-        elif (shape := np.shape(parameters[name])) != expected.get(name):
-            wanted = f"shape {expected[name]}" if name in expected else "none of that name"
-            yield f"policy parameter {name!r}: expected {wanted}, got {shape}"
-
-
 def checked(parameters: Parameters, expected: Shapes) -> dict[str, FloatArray]:
     """Float32 copies of parameters that have the expected shapes.
 
     Raises:
         PolicyError: a parameter is missing, left over, of another shape, or not finite.
     """
-    for misfit in misfits(parameters, expected):
-        raise PolicyError(f"{misfit}; export it again")
+    for name in [*expected, *(name for name in parameters if name not in expected)]:
+        if name not in parameters:
+            raise PolicyError(f"policy parameter {name!r} is missing, expected shape {expected[name]}; export it again")
+        if (shape := np.shape(parameters[name])) != expected.get(name):
+            wanted = f"shape {expected[name]}" if name in expected else "none of that name"
+            raise PolicyError(f"policy parameter {name!r}: expected {wanted}, got {shape}; export it again")
     for name, value in parameters.items():
         about = f"policy parameter {name!r}"
         if value.dtype.kind != "f":

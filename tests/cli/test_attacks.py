@@ -157,7 +157,7 @@ TYPED = {
     "an id with a line end": ((*PRETRAIN, "--run-id", "x\n"), "--run-id 'x\\n'"),
     "true as a number": ((*PRETRAIN, "--run-dir", "new", "--set", "game.num_worlds=true"), "expected a number"),
     "a lock that is a link": ((*PRETRAIN, "--run-dir", "locked"), "locked/.lock: a symbolic link"),
-    "a host that is no text": (("serve", "--runs", ".", "--host", NOT_UTF8), "--host is a name or address"),
+    "a host that is no text": (("serve", "--runs", ".", "--host", NOT_UTF8), "is no name of a host"),
     "a file as registry": (("registry", "list", "--registry", "tiny.yaml"), "tiny.yaml is no directory"),
     "a token from a FIFO": (("serve", "--runs", ".", "--token-file", "fifo"), "--token-file fifo: not a regular file"),
     "a token from a device": (("serve", "--runs", ".", "--token-file", "/dev/zero"), "/dev/zero: not a regular file"),

@@ -16,9 +16,10 @@ from ray.exceptions import ObjectLostError
 from torch import cuda
 
 from benchmarks.processes import descendants
+from service.base.errors import ConfigError
 from service.cluster import actor_pool, self_play, watch
 from service.cluster.ray_actors import NICENESS
-from service.cluster.ray_connection import ClusterOptions, connected
+from service.cluster.ray_connection import ClusterOptions, connected, explaining_ray_errors
 from service.cluster.ray_runtime import RayRuntime
 from service.cluster.remote_worker import RemoteWorker
 from service.cluster.self_play import RaySelfPlay, num_gpus
@@ -197,7 +198,7 @@ def test_workers_that_are_killed_are_replaced_and_no_others(tmp_path, monkeypatc
         lost_s[0] += 60.0
         if worker.name in doomed:
             doomed.remove(worker.name)
-            os.kill(ray.get(worker._handle.ping.remote())["pid"], signal.SIGKILL)
+            os.kill(ray.get(worker.watch.handle.ping.remote())["pid"], signal.SIGKILL)
         wait(worker)
 
     monkeypatch.setattr(Run, "_save", save_slowly)
@@ -259,7 +260,8 @@ def test_workers_that_hang_are_replaced_and_one_that_is_late_is_not(tmp_path, mo
         for name in set(frozen) & set(played):
             if workers_of(run)[name].incarnation == 0:
                 method = run.method
-                on_the_way = len(method._pending) + len(method._current.batch)
+                batch = method._current.batch if method._current is not None else ()
+                on_the_way = len(method._pending) + len(batch)
                 played[name].append((run.iteration, on_the_way, len(method._pool.rounds)))
 
     run, result = run_cluster(tmp_path, story=freeze, on_beat=look)
@@ -339,7 +341,9 @@ def test_what_is_lost_or_cannot_be_mended(monkeypatch):
         counted = ray.get(method._learner.state)["counted"]
         num_played = sum(int(highest) + 1 for _, _, highest in counted)
         assert method.health().num_rollouts_counted == num_played - len(lost)
-        assert method._learner.incarnation == method._generator.incarnation == method._pool.next_incarnation - 1 == 0
+        workers = method._learner, method._generator
+        assert [each.watch.incarnation for each in workers] == [0, 0]
+        assert method._pool.next_incarnation == 1
 
         monkeypatch.setattr(self_play, "MAX_ATTEMPTS", 2)
         restart = RemoteWorker.restart
@@ -367,7 +371,7 @@ def test_a_learner_that_cannot_start_is_one_line(monkeypatch):
     monkeypatch.setattr(self_play, "num_gpus", lambda device: 0)  # Ray would wait for one
     learner = tiny_config().learner.model_copy(update={"device": "cuda"})
     method = RaySelfPlay(tiny_config().model_copy(update={"learner": learner}), ClusterOptions(num_actors=1))
-    with pytest.raises(WorkersError) as error:
+    with pytest.raises(ConfigError) as error, explaining_ray_errors():
         method.start()
     method.close()
     assert_one_line(error.value, "learner.device", "no CUDA device", "learner.device=cpu")
@@ -381,7 +385,7 @@ def test_actors_that_wait_for_a_core_do_not_end_the_run(tmp_path, monkeypatch):
     warnings = set()
 
     def hurry(run):
-        while sum(slot.incarnation for slot in run.method._pool) < 4:
+        while sum(slot.watch.incarnation for slot in run.method._pool) < 4:
             yield
             for slot in run.method._pool:
                 slot.may_start_s = min(slot.may_start_s, 1.0)

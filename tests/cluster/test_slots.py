@@ -2,8 +2,8 @@
 
 import pytest
 
+from service.actors.rollout import MAX_POLICY_LAG
 from service.cluster.iteration import may_begin, may_update
-from service.learner.weights import MAX_POLICY_LAG
 
 
 def test_an_update_waits_for_a_round_that_would_get_too_old():

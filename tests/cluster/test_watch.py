@@ -18,7 +18,7 @@ class Worker:
         ready = lambda references, timeout: (references, []) if self.answers else ([], references)  # noqa: E731
         monkeypatch.setattr(watch, "ray", SimpleNamespace(wait=ready, get=lambda reference: reference()))
         self.clock = Clock()
-        self.watch = Watch(self.ask, self.clock)
+        self.watch = Watch("learner", 0, SimpleNamespace(progress=SimpleNamespace(remote=self.ask)), self.clock)
 
     def ask(self):
         self.num_asked += 1

@@ -3,6 +3,7 @@
 import functools
 import re
 import shlex
+import subprocess
 from pathlib import Path
 
 import yaml
@@ -89,6 +90,12 @@ def snippets(document):
     return [
         block for block in blocks if re.match(r"(docker|kubectl|ray|tandem|sh|export|curl|promtool|redis-cli)\b", block)
     ]
+
+
+def check_syntax(script):
+    """Let a shell parse it; nothing is run."""
+    result = subprocess.run(["sh", "-n"], input=script, capture_output=True, text=True, timeout=600, check=False)
+    assert result.returncode == 0, f"{result.stderr}\n{script}"
 
 
 def commands(text, program):

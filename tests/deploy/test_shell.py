@@ -5,7 +5,6 @@ import shutil
 import socket
 import stat
 import subprocess
-import time
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -16,7 +15,19 @@ import yaml
 from redis.backoff import NoBackoff
 from redis.retry import Retry
 
-from tests.deploy.files import DEPLOY, DOCUMENTS, SCRIPTS, YAML, compose, manifest, manifests, snippets, walk
+from tests.deploy.files import (
+    DEPLOY,
+    DOCUMENTS,
+    SCRIPTS,
+    YAML,
+    check_syntax,
+    compose,
+    manifest,
+    manifests,
+    snippets,
+    walk,
+)
+from tests.store.stores import wait_until
 
 HEALTH_CHECKS = [each["healthcheck"]["test"][1] for each in compose()["services"].values() if "healthcheck" in each]
 PROBES = [
@@ -29,11 +40,6 @@ def redis_scripts():
     (box,) = manifest("StatefulSet", "redis")["spec"]["template"]["spec"]["containers"]
     (in_compose,) = compose()["services"]["redis"]["command"]
     return {"compose": in_compose.replace("$$", "$"), "kubernetes": box["args"][0]}
-
-
-def check_syntax(script):
-    result = subprocess.run(["sh", "-n"], input=script, capture_output=True, text=True, timeout=600, check=False)
-    assert result.returncode == 0, f"{result.stderr}\n{script}"
 
 
 def test_scripts_parse_and_stop_at_errors():
@@ -157,13 +163,6 @@ def accepts(path):
     """Whether a server takes connections at this Unix socket: the file is there a moment before anybody listens."""
     with socket.socket(socket.AF_UNIX) as client:
         return client.connect_ex(str(path)) == 0
-
-
-def wait_until(happened, seconds=300):
-    deadline = time.monotonic() + seconds
-    while not happened():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 # --- no secret in files ----------------------------------------------------------------------------------------------

@@ -11,7 +11,15 @@ from service.base.errors import ConfigError
 from service.config import dump_config, load_config
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
 from service.envs.objects import GRIPPER_BIT
-from tests.envs.robots import GANTRY, GANTRY_DESCRIPTION, PINCHER, URDF, URDF_DESCRIPTION, write_robot
+from tests.envs.robots import (
+    GANTRY,
+    GANTRY_DESCRIPTION,
+    PINCHER,
+    PINCHER_DESCRIPTION,
+    URDF,
+    URDF_DESCRIPTION,
+    write_robot,
+)
 from tests.envs.scripted import CLOSE, drive, grasp, place_in_air
 from tests.envs.test_meshes import write_box
 from tests.runs.runs import assert_one_line
@@ -213,38 +221,27 @@ def test_mistakes_in_a_description_are_one_line(tmp_path, changed, said):
     assert_one_line(error.value, "pincher", *said)
 
 
+TURNS, ROLLS_FREELY = '<joint name="roll" axis="0 0 1" range="-3 3"/>', '<joint name="roll" type="ball"/>'
+
+
 @pytest.mark.parametrize(
     ("model", "said"),
     [
         ("<mujoco", ["MuJoCo cannot read it"]),
-        (
-            PINCHER.replace('<joint name="roll" axis="0 0 1" range="-3 3"/>', '<joint name="roll" type="ball"/>'),
-            ["hinge"],
-        ),
+        (PINCHER.replace(TURNS, ROLLS_FREELY), ["hinge"]),
         (PINCHER.replace("</worldbody>", '<body name="cup"/></worldbody>'), ["2 bodies at its top", "base, cup"]),
-    ],
-    ids=["no XML", "a ball joint", "two roots"],
-)
-def test_models_that_do_not_fit_are_one_line(tmp_path, model, said):
-    with pytest.raises(ConfigError) as error:
-        WorldBatch(world_of(write_robot(tmp_path, model)), 1)
-    assert_one_line(error.value, "pincher", *said)
-
-
-@pytest.mark.parametrize(
-    ("model", "said"),
-    [
         ("<robot name='sixer'><link name='base'/>", ["MuJoCo cannot read it"]),
         (URDF.replace('<child link="tool"/>', '<child link="tools"/>'), ["sixer.urdf", "MuJoCo cannot read it"]),
         (with_mesh("a.stl"), ["a.stl", "MuJoCo cannot build it"]),
         (with_mesh("package://arms/a.stl"), ["a.stl", "ROS package 'arms'", "no directory above"]),
     ],
-    ids=["cut off", "a link that is not there", "a mesh that is not there", "a package that is not there"],
+    ids=["no XML", "a ball joint", "two roots", "cut off", "no such link", "no such mesh", "no such package"],
 )
-def test_urdfs_that_do_not_fit_are_one_line(tmp_path, model, said):
+def test_models_that_do_not_fit_are_one_line(tmp_path, model, said):
+    description = URDF_DESCRIPTION if "<robot" in model else PINCHER_DESCRIPTION
     with pytest.raises(ConfigError) as error:
-        WorldBatch(world_of(write_robot(tmp_path, model, URDF_DESCRIPTION)), 1)
-    assert_one_line(error.value, "sixer", *said)
+        WorldBatch(world_of(write_robot(tmp_path, model, description)), 1)
+    assert_one_line(error.value, description["name"], *said)
 
 
 @pytest.mark.parametrize(

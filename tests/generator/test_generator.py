@@ -341,7 +341,12 @@ def test_stops_on_current_players_own_goals_only() -> None:
 
 def test_opponents_are_due_every_interval() -> None:
     generator = TaskGenerator(config(opponent_interval=10), FREE)
-    assert [iteration for iteration in range(35) if generator.opponents_due(iteration)] == [10, 20, 30]
+    joined = []
+    for iteration in range(35):
+        before = generator.opponents
+        generator.add_opponents(iteration, {"w": np.ones(2)}, {"w": np.ones(2)})
+        joined += [iteration] * (generator.opponents is not before)
+    assert joined == [10, 20, 30]
 
 
 def test_a_snapshot_is_a_copy() -> None:
@@ -400,7 +405,7 @@ def play(generator: TaskGenerator, rng: np.random.Generator, iterations: range) 
                 record(generator, records, starts_of(list(start_state[0]))),
             )
         )
-        if generator.opponents_due(iteration):
+        if iteration % 3 == 0:
             generator.add_opponents(iteration, {"a/w": rng.normal(size=3)}, {"b.w": rng.normal(size=(2, 2))})
         outcomes.append(generator.should_stop())
     return outcomes

@@ -245,7 +245,7 @@ def test_a_policy_ahead_of_the_one_that_acted_does_not_stop():
     stats = train(player, lagging, None, ABC, np.random.default_rng(0))
     assert not stats.stopped
     assert stats.kls[0] == pytest.approx(0.0, abs=1e-6)
-    assert stats.means()["clip_fraction"] == 0.0  # the clip range is this update's own
+    assert torch.stack(stats.scalars["clip_fraction"]).mean() == 0.0  # the clip range is this update's own
 
 
 def test_samples_of_a_lagging_policy_are_weighted_by_what_has_changed_since():

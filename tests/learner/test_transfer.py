@@ -17,9 +17,9 @@ SMALL = PolicyConfig(
 WIDER = Layouts(num_commands=2)
 MAKERS = {
     "alice": (networks.make_alice, "full"),
-    "alice_value": (networks.make_alice_value, "full"),
+    "alice_value": (lambda config, seen: networks.ValueNetwork(seen.full.normalisation, config.value), "full"),
     "bob": (networks.make_bob, "bob"),
-    "bob_value": (networks.make_bob_value, "bob_value"),
+    "bob_value": (lambda config, seen: networks.ValueNetwork(seen.bob_value.normalisation, config.value), "bob_value"),
 }
 
 

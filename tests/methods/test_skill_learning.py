@@ -140,7 +140,7 @@ def small_config(**skills):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_loop_in_worlds_goes_on_bit_for_bit(method):
-    loops = [make_skill_loop(small_config(method=method)) for _ in range(2)]
+    loops = [make_skill_loop(small_config(method=method))[0] for _ in range(2)]
     first, second = loops
     first.play(150)
     second.load_state(*first.state())
@@ -156,7 +156,7 @@ def test_a_loop_in_worlds_goes_on_bit_for_bit(method):
 
 
 def test_a_skill_lasts_an_episode():
-    loop = make_skill_loop(small_config())
+    loop, *_ = make_skill_loop(small_config())
     loop.play(80)
     skill = loop.replay.state()["skill"]
     assert skill.shape == (20, 4, 4)
@@ -168,12 +168,12 @@ def test_a_skill_lasts_an_episode():
 
 
 def test_rewards_are_scaled_and_see_the_object_alone():
-    loop = make_skill_loop(small_config(reward_scale=3.0))
+    loop, *_ = make_skill_loop(small_config(reward_scale=3.0))
     loop.play(80)
     batch = loop.make_batch(loop.replay, 64, np.random.default_rng(0))
     assert len(loop.make_batch.losses) == 2
     assert batch.inputs.shape == batch.next_inputs.shape == (64, 21)
-    plain = make_skill_loop(small_config())
+    plain, *_ = make_skill_loop(small_config())
     plain.load_state(*loop.state())
     plain.make_batch.reward.load_state(loop.make_batch.reward.state())
     rng = np.random.default_rng(1)

@@ -35,7 +35,7 @@ def learned(config, make_actor):
     """Weights, and a generator that has past players and goals to replay."""
     generator, weights, actor = GeneratorWorker(config), Learner(config).weights(), make_actor()
     for iteration in range(10):
-        _, goals, _ = actor.play(weights, generator.generator.snapshot(), generator.opponents())
+        _, goals, _ = actor.play(weights, generator.generator.snapshot(), generator.generator.opponents)
         generator.record(iteration, weights, [goals])
     return weights, generator
 
@@ -49,7 +49,7 @@ def as_sent(value):
 
 def test_a_round_is_a_function_of_what_it_is_given(learned, make_actor):
     weights, generator = learned
-    given = weights, generator.generator.snapshot(), generator.opponents()
+    given = weights, generator.generator.snapshot(), generator.generator.opponents
     sent = as_sent(given)
     assert not sent[1].buffer["goal"].flags.writeable
     here, there = make_actor(), make_actor()
@@ -67,7 +67,7 @@ def test_a_round_is_a_function_of_what_it_is_given(learned, make_actor):
 
 def test_the_generator_hears_of_every_game_that_began(learned, make_actor, config):
     weights, generator = learned
-    given, actor = (generator.generator.snapshot(), generator.opponents()), make_actor(1)
+    given, actor = (generator.generator.snapshot(), generator.generator.opponents), make_actor(1)
     began = []
     for _ in range(3):
         before = actor.game.worlds.states.copy()
@@ -81,7 +81,7 @@ def test_the_generator_hears_of_every_game_that_began(learned, make_actor, confi
 
 def test_many_rounds_of_an_iteration_share_the_places(learned, make_actor, config):
     weights, generator = learned
-    given = generator.generator.snapshot(), generator.opponents()
+    given = generator.generator.snapshot(), generator.generator.opponents
     alone, one_of_many = make_actor(), make_actor()
     _, whole, _ = alone.play(weights, *given)
     _, sample, _ = one_of_many.play(weights, *given, num_rounds=config.generator.replay_buffer_size // 2)
@@ -94,7 +94,7 @@ def test_many_rounds_of_an_iteration_share_the_places(learned, make_actor, confi
 
 def test_past_players_are_built_once(learned, make_actor, config):
     weights, generator = learned
-    snapshot, opponents, actor = generator.generator.snapshot(), generator.opponents(), make_actor()
+    snapshot, opponents, actor = generator.generator.snapshot(), generator.generator.opponents, make_actor()
     built = []
     for _ in range(2):
         _, goals, _ = actor.play(weights, snapshot, opponents)
@@ -104,8 +104,8 @@ def test_past_players_are_built_once(learned, make_actor, config):
     versions = []
     for iteration in range(interval + 1):
         generator.record(iteration, weights, [goals])
-        versions.append(generator.opponents().version)
+        versions.append(generator.generator.opponents.version)
     assert versions == [opponents.version] * interval + [interval]
-    actor.play(weights, snapshot, generator.opponents())
+    actor.play(weights, snapshot, generator.generator.opponents)
     assert actor._past is not built[0]
-    assert len(actor._past) == len(generator.opponents().alice) == config.generator.opponent_pool_size
+    assert len(actor._past) == len(generator.generator.opponents.alice) == config.generator.opponent_pool_size

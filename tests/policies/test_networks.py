@@ -15,12 +15,11 @@ from service.policies.gaussian import log_prob
 from service.policies.networks import (
     GaussianPolicy,
     MCPPolicy,
+    ValueNetwork,
     elu,
     export_parameters,
     make_alice,
-    make_alice_value,
     make_bob,
-    make_bob_value,
     use_bfloat16,
 )
 from service.policies.parameters import FloatArray
@@ -42,8 +41,8 @@ def test_shapes(alice: GaussianPolicy, bob: MCPPolicy, config: PolicyConfig) -> 
             assert mean.dtype == torch.float32
     means, variances = bob.primitives(torch.zeros(2, 5, POSITIONS.size))
     assert means.shape == variances.shape == (2, 5, config.bob.num_primitives, ACTION.size)
-    assert make_alice_value(config)(torch.zeros(2, 5, FULL.size)).shape == (2, 5)
-    assert make_bob_value(config)(torch.zeros(2, 5, BOB_VALUE.size)).shape == (2, 5)
+    assert ValueNetwork(FULL.normalisation, config.value)(torch.zeros(2, 5, FULL.size)).shape == (2, 5)
+    assert ValueNetwork(BOB_VALUE.normalisation, config.value)(torch.zeros(2, 5, BOB_VALUE.size)).shape == (2, 5)
 
 
 def test_goal_reaches_only_the_gate(bob: MCPPolicy, observe: Observe) -> None:
@@ -157,8 +156,9 @@ def test_initial_primitives_and_weights_differ() -> None:
 
 @pytest.mark.usefixtures("seeded")
 def test_initial_values_are_near_zero() -> None:
-    assert make_alice_value(PolicyConfig())(torch.randn(100, FULL.size)).abs().max() < 0.1
-    assert make_bob_value(PolicyConfig())(torch.randn(100, BOB_VALUE.size)).abs().max() < 0.1
+    for layout in (FULL, BOB_VALUE):
+        value = ValueNetwork(layout.normalisation, PolicyConfig().value)
+        assert value(torch.randn(100, layout.size)).abs().max() < 0.1
 
 
 def test_log_prob_has_a_gradient_for_every_parameter(alice: GaussianPolicy, bob: MCPPolicy, observe: Observe) -> None:

@@ -16,7 +16,6 @@ from service.envs.sampling import draw_goals
 from service.registry.registry import Registry
 from service.runs import train as module
 from service.runs.resuming import resumed_config
-from service.runs.signals import InterruptError
 from service.runs.train import UnfinishedError, train
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import (
@@ -183,17 +182,6 @@ def test_a_signal_ends_the_run_after_the_iteration(tmp_path, quick, number):
     assert newest(tmp_path / "run").step == 2
     assert not (tmp_path / "registry").exists()
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
-
-
-def test_a_second_signal_ends_it_at_once(tmp_path, quick):
-    def interrupt_twice(metrics):
-        if metrics["iteration"] == 2:
-            os.kill(os.getpid(), signal.SIGINT)
-            os.kill(os.getpid(), signal.SIGINT)
-
-    with pytest.raises(InterruptError, match="SIGINT"):
-        run_pretrain(tmp_path, on_iteration=interrupt_twice)
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_signal_saves_and_says_how_to_resume(tmp_path):

@@ -99,13 +99,6 @@ def test_a_hole_that_is_accepted_is_named_and_asked_about_once(run, tmp_path, mo
     assert (second["damaged_records"], manifest.history["run"]) == ([], read_history(run).run)
 
 
-def test_records_after_the_checkpoint_may_be_anything(run):
-    """They are made again."""
-    with (run / "metrics.jsonl").open("ab") as file:
-        file.write(b'{"iteration": 99, "env_steps": 5}\n{"iteration": 100, "env_st')
-    assert go_on(run) == "finished"
-
-
 def test_a_checkpoint_of_another_run_is_refused(run, tmp_path):
     play(tmp_path / "other", tiny_config(total_env_steps=600))
     shutil.rmtree(run / "checkpoints")
@@ -135,10 +128,6 @@ def test_a_configuration_that_may_change_is_said_and_noted(run, caplog):
     (event,) = read_history(run).events
     assert event.changed["learner.bob.learning_rate"] == (0.0003, 1e-5)
     assert event.changed["run.total_env_steps"] == (600, 800)
-
-
-def test_a_run_may_be_moved(run, tmp_path):
-    assert go_on(run.rename(tmp_path / "elsewhere")) == "finished"
 
 
 @pytest.mark.parametrize("version", ["0.1.0", "0.2.0", "0.4.1"])

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from contextlib import nullcontext
 
 import numpy as np
@@ -58,21 +57,13 @@ from tests.runs.runs import (
     tiny_config,
     write_yaml,
 )
-
-PATIENCE_S = 300.0
+from tests.store.stores import wait_until
 
 
 def tandem(*arguments, **environment):
     """Run a command in this process."""
     variables = {"COLUMNS": "80", "PYTHONPATH": str(ROOT), "MUJOCO_GL": "off", **environment}
     return CliRunner().invoke(app, [str(argument) for argument in arguments], env=variables)
-
-
-def wait_for(what):
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not what():
-        assert time.monotonic() < deadline_s, "not within 300 s"
-        time.sleep(0.02)
 
 
 # --- seeds and cores -------------------------------------------------------------------------------------------------
@@ -313,10 +304,10 @@ def test_runs_begin_in_turn_and_are_asked_to_stop_and_then_to_end(tmp_path, num_
     configs = {name: load_config(study.config_file(name)) for name in ("seed-0", "seed-1")}
 
     def run(job, asked):
-        wait_for(lambda: Study(study.path).read().runs[job.directory.name].state == "running")
+        wait_until(lambda: Study(study.path).read().runs[job.directory.name].state == "running")
         for wanted in range(1, num_signals + 1):
             os.kill(os.getpid(), signal.SIGINT)
-            wait_for(lambda wanted=wanted: asked() == wanted)
+            wait_until(lambda wanted=wanted: asked() == wanted)
         told[job.directory.name] = (asked(), job.options)
         return job.run.now("failed", "no luck") if num_signals == 0 else job.run.now("interrupted")
 
@@ -375,11 +366,11 @@ def test_a_study_is_killed_stopped_resumed_and_names_its_best(tmp_path, monkeypa
     def trouble():
         """One run is killed, and the other goes on; then all are stopped."""
         try:
-            wait_for(lambda: saved(3) and saved(8))
+            wait_until(lambda: saved(3) and saved(8))
             os.kill(json.loads((path / "seed-8" / ".lock").read_text())["pid"], signal.SIGKILL)
-            wait_for(lambda: told()["seed-8"] == "failed")
+            wait_until(lambda: told()["seed-8"] == "failed")
             before = newest(path / "seed-3").step
-            wait_for(lambda: newest(path / "seed-3").step > before)
+            wait_until(lambda: newest(path / "seed-3").step > before)
         finally:
             os.kill(os.getpid(), signal.SIGINT)
 
@@ -448,12 +439,12 @@ def test_two_tasks_are_killed_with_their_study_and_go_on(tmp_path):
 
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
         try:
-            wait_for(lambda: process.poll() is not None or saved())
+            wait_until(lambda: process.poll() is not None or saved())
             assert process.poll() is None, process.stderr.read()
         finally:
             process.kill()  # at once with the run, which the kernel would tell to save
         os.kill(json.loads((begun / ".lock").read_text())["pid"], signal.SIGKILL)
-        wait_for(lambda: not is_locked(begun))
+        wait_until(lambda: not is_locked(begun))
     states = {name: run.state for name, run in study.read().runs.items()}
     assert states == {"push-seed-0": "running", "wall-seed-0": "waiting"}
     assert {run.study for run in DiskReader(tmp_path).runs()} == {"night"}  # the page shows them as one
