@@ -16,7 +16,7 @@ from service.base.errors import (
     one_line,
 )
 from service.base.extras import needs_extra
-from service.base.files import os_errors, write_atomic
+from service.base.files import write_atomic
 from service.registry.blobs import BlobStore, check_digest
 from service.registry.manifest import parse_manifest
 from service.registry.names import Version, split_reference
@@ -79,8 +79,7 @@ def fetch_primitives(
             check_digest(f"{manifest.reference} from {base}", data, digest)
             blobs.put(data)
     path = registry.root / "models" / name / "versions" / str(manifest.version)
-    with os_errors("write", path):  # after its parameters: a version that is listed can be loaded
-        write_atomic(path, manifest.to_bytes())
+    write_atomic(path, manifest.to_bytes())  # after its parameters: a version that is listed can be loaded
     return registry, Version(name, manifest.version)
 
 

@@ -223,9 +223,8 @@ class Registry:
         for path in files:
             if path.exists():
                 raise RegistryError(f"cannot export {manifest.reference}: {path} exists; choose another directory")
-        with os_errors("write", directory):
-            for path, data in files.items():
-                write_atomic(path, data)
+        for path, data in files.items():
+            write_atomic(path, data)
         return manifest
 
     def _publish_version(self, name: str, parameters: Mapping[str, np.ndarray], fields: dict[str, Any]) -> Version:
@@ -240,9 +239,8 @@ class Registry:
             # unique: only one writer makes number n; contiguous: no writer tries n + 1 before n is there
             version = Version(name, max((last.number for last in self.versions(name)), default=0) + 1)
             path = self._manifest_path(version)
-            with os_errors("write", path):
-                if write_exclusive(path, make_manifest({**fields, "version": version.number}).to_bytes()):
-                    return version
+            if write_exclusive(path, make_manifest({**fields, "version": version.number}).to_bytes()):
+                return version
 
     def _read_alias(self, name: str, alias: str) -> int | None:
         """The number ``alias`` means; None when there is no such alias."""
