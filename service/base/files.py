@@ -79,9 +79,7 @@ def _descriptor(path: Path, flags: int, *, follow: bool) -> int:
     return descriptor
 
 
-def write_atomic(
-    path: Path, data: bytes, error_type: type[StorageError] = StorageError, *, flush: bool = True
-) -> None:
+def write_atomic(path: Path, data: bytes, error_type: type[StorageError] = StorageError, *, flush: bool = True) -> None:
     """Put ``data`` at ``path``, replacing what was there in one step; the directory is made when missing.
 
     Args:

@@ -12,11 +12,12 @@ Metrics are in ``metrics.jsonl``, where the run writes them for itself.
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol, Self, get_args
+from typing import Literal, NamedTuple, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -225,33 +226,41 @@ class GoalGrid(FrozenModel):
     cells: tuple[GoalCell, ...]
 
 
-class RunReader(Protocol):
+class RunReader(ABC):
     """A place the status service reads runs from.
 
     Every method may raise ``StoreUnavailableError``, and ``DamagedStoreError`` where the store holds what no run has
     written. Those that take a run id raise ``UnknownRunError`` where there is no such run.
     """
 
+    @abstractmethod
     def runs(self) -> list[RunStatus]:
         """All runs, newest start first."""
 
+    @abstractmethod
     def run(self, run_id: str) -> RunStatus:
         """One run."""
 
+    @abstractmethod
     def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
         """The records of iterations above ``after_iteration``, in order, each iteration once (a resumed run's last)."""
 
+    @abstractmethod
     def columns(self, run_id: str, names: Sequence[str] | None) -> Columns:
         """These metrics of all iterations, None for all metrics; those that the run does not have are left out."""
 
+    @abstractmethod
     def sample(self, run_id: str, name: str, number: int) -> list[float | None]:
         """One metric of about ``number`` records, evenly over the run: fast, whatever else the run has recorded."""
 
+    @abstractmethod
     def goals(self, run_id: str) -> GoalGrid | None:
         """The newest grid; None before the first."""
 
+    @abstractmethod
     def request_stop(self, run_id: str) -> None:
         """Ask a run to end after its current iteration, saved; nothing happens if it has ended."""
 
+    @abstractmethod
     def ready(self) -> None:
         """Return if reads work right now."""
