@@ -13,9 +13,9 @@ from service.base.errors import (
     TandemError,
     UnknownVersionError,
     WrongTokenError,
+    needs_extra,
     one_line,
 )
-from service.base.extras import needs_extra
 from service.base.files import write_atomic
 from service.registry.blobs import BlobStore, check_digest
 from service.registry.manifest import parse_manifest

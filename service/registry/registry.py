@@ -42,6 +42,9 @@ Check = Callable[[Manifest, Mapping[str, np.ndarray]], Iterable[str]]
 class Registry:
     """Named, versioned parameters in the directory ``root``; any number of processes may publish and read at once."""
 
+    is_only_read = False
+    """Whether it is, also without the file that marks one."""
+
     def __init__(self, root: Path) -> None:
         self.root = root
         self._blobs = BlobStore(root / "blobs")
@@ -52,15 +55,12 @@ class Registry:
         Raises:
             RegistryError: it is marked as only read, as the one that comes with tandem is.
         """
-        if (self.root / READ_ONLY_FILE).exists():  # a file: it is found through whatever path leads to the directory
-            raise self.only_read()
-
-    def only_read(self) -> RegistryError:
-        """Make the error of a write to a registry that is only read."""
-        return RegistryError(
-            f"cannot write {self.root}: this registry is only read; "
-            "name another directory with --registry or TANDEM_REGISTRY"
-        )
+        # a file: it is found through whatever path leads to the directory
+        if self.is_only_read or (self.root / READ_ONLY_FILE).exists():
+            raise RegistryError(
+                f"cannot write {self.root}: this registry is only read; "
+                "name another directory with --registry or TANDEM_REGISTRY"
+            )
 
     def publish(
         self,
