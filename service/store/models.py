@@ -184,24 +184,19 @@ class Pulse:
         self._seen: dict[str, tuple[datetime, float, float]] = {}
         """By run: its heartbeat, and the clock at that and at the last look."""
 
-    def age_s(self, run_id: str, heartbeat: datetime) -> float:
-        """Seconds since a run's last heartbeat; never negative."""
-        by_date = max(0.0, (datetime.now(UTC) - heartbeat).total_seconds())
-        now_s = self._clock()
-        last, beat_s, looked_s = self._seen.get(run_id, (heartbeat, now_s - by_date, now_s))
-        if heartbeat != last:  # it came at some time since the last look
-            beat_s = max(now_s - by_date, looked_s)
-        self._seen[run_id] = heartbeat, beat_s, now_s
-        return now_s - beat_s
-
     def look(self, status: RunStatus) -> tuple[RunStatus, float]:
-        """The status of a run, and how long ago it was heard of; one from the future has a warning."""
-        age_s = self.age_s(status.run_id, status.heartbeat)
-        ahead = status.heartbeat - datetime.now(UTC)
-        if status.state in ACTIVE and ahead > MAX_AHEAD:
-            text = f"its heartbeat is {ahead.total_seconds():.0f} s in the future: the clock of its machine, or the one"
+        """The status of a run, a warning in one from the future; and seconds since it was heard of, never negative."""
+        heartbeat, now_s = status.heartbeat, self._clock()
+        age = datetime.now(UTC) - heartbeat
+        begun_s = now_s - max(0.0, age.total_seconds())
+        last, beat_s, looked_s = self._seen.get(status.run_id, (heartbeat, begun_s, now_s))
+        if heartbeat != last:  # it came at some time since the last look
+            beat_s = max(begun_s, looked_s)
+        self._seen[status.run_id] = heartbeat, beat_s, now_s
+        if status.state in ACTIVE and -age > MAX_AHEAD:
+            text = f"its heartbeat is {-age.total_seconds():.0f} s in the future: the clock of its machine, or the one"
             status = status.suffering("clock", f"{text} here, is wrong")
-        return status, age_s
+        return status, now_s - beat_s
 
 
 class GoalCell(FrozenModel):
