@@ -85,7 +85,7 @@ class ExportedVersion(Registry):
         self._file = root / EXPORTED_MANIFEST
         manifest = read_manifest(self._file)
         self.version = Version(manifest.name, manifest.version)
-        self._blobs = _OneBlob(root)
+        self.blobs = _OneBlob(root)
 
     def _manifest_path(self, version: Version) -> Path:
         return self._file if version == self.version else super()._manifest_path(version)

@@ -17,7 +17,7 @@ from service.base.errors import (
     one_line,
 )
 from service.base.files import write_atomic
-from service.registry.blobs import BlobStore, check_digest
+from service.registry.blobs import check_digest
 from service.registry.manifest import parse_manifest
 from service.registry.names import Version, split_reference
 from service.registry.registry import Registry
@@ -71,13 +71,13 @@ def fetch_primitives(
             raise DamagedBlobError(
                 f"{base} gave the manifest of {manifest.reference} for {reference}; check its registry"
             )
-        digest, blobs = manifest.blob_sha256, BlobStore(registry.root / "blobs")
+        digest = manifest.blob_sha256
         try:
-            blobs.get(digest)
+            registry.blobs.get(digest)
         except DamagedBlobError:  # or not there yet
             data = _get(service, f"/v1/blobs/sha256/{digest}")
             check_digest(f"{manifest.reference} from {base}", data, digest)
-            blobs.put(data)
+            registry.blobs.put(data)
     path = registry.root / "models" / name / "versions" / str(manifest.version)
     write_atomic(path, manifest.to_bytes())  # after its parameters: a version that is listed can be loaded
     return registry, Version(name, manifest.version)

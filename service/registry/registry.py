@@ -47,7 +47,7 @@ class Registry:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self._blobs = BlobStore(root / "blobs")
+        self.blobs = BlobStore(root / "blobs")
 
     def check_writable(self) -> None:
         """Check that this registry may be written.
@@ -141,7 +141,7 @@ class Registry:
             StorageError: as for `manifest`; DamagedBlobError also for damaged parameters.
         """
         manifest = self.manifest(reference)
-        return manifest, tensors.decode(self._blobs.get(manifest.blob_sha256))
+        return manifest, tensors.decode(self.blobs.get(manifest.blob_sha256))
 
     def names(self) -> list[str]:
         """Every name that has a version, sorted.
@@ -217,7 +217,7 @@ class Registry:
         """
         manifest, _ = self.load(reference)
         files = {
-            directory / EXPORTED_PARAMETERS: self._blobs.get(manifest.blob_sha256),
+            directory / EXPORTED_PARAMETERS: self.blobs.get(manifest.blob_sha256),
             directory / EXPORTED_MANIFEST: manifest.to_bytes(),
         }
         for path in files:
@@ -234,7 +234,7 @@ class Registry:
             raise RegistryError(f"cannot publish {name}: {error}") from None
         fields |= {"blob_sha256": sha256_of(data), "blob_bytes": len(data)}
         make_manifest({**fields, "version": 1})  # a bad value must be found before anything is written
-        self._blobs.put(data)
+        self.blobs.put(data)
         while True:
             # unique: only one writer makes number n; contiguous: no writer tries n + 1 before n is there
             version = Version(name, max((last.number for last in self.versions(name)), default=0) + 1)
