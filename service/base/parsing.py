@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from service.base.errors import StorageError, one_line
+from service.base.errors import TandemError, one_line
 
 MAX_DEPTH = 64
 """Groups within groups; a configuration has five."""
@@ -31,7 +31,7 @@ MAX_YAML_VALUES = 5000
 _Value = TypeVar("_Value")
 
 
-class ParseError(StorageError):
+class ParseError(TandemError):
     """A text is neither JSON nor YAML, or nothing that could be worked with.
 
     Args:

@@ -9,8 +9,9 @@ from typing import TypeVar
 
 from pydantic import AwareDatetime, Field, JsonValue
 
+from service.base.errors import StorageError
 from service.base.files import os_errors, read_regular, write_atomic
-from service.base.parsing import parse_with
+from service.base.parsing import ParseError, parse_with
 from service.base.version import __version__
 from service.config.frozen import FrozenModel
 
@@ -86,4 +87,7 @@ def read_note(path: Path, parser: Callable[[bytes], _Note]) -> _Note | None:
             data = read_regular(path, MAX_BYTES, follow=True)
         except FileNotFoundError:
             return None
-    return parse_with(parser, data, path)
+    try:
+        return parse_with(parser, data, path)
+    except ParseError:
+        raise StorageError(f"{path} is damaged; restore it from a copy, or remove it") from None
