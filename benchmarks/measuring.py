@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 
 from benchmarks.report.markdown import table
 from service.base.errors import TandemError
-from service.base.files import os_errors, write_atomic
+from service.base.files import write_atomic
 from service.base.version import git_commit
 from service.registry.loading import Trained, load
 
@@ -133,8 +133,7 @@ def describe_ratio(name: str, each: dict[str, float]) -> str:
 
 def write_json(path: Path, result: dict[str, Any]) -> None:
     """Write a result, its innermost lists on one line each."""
-    with os_errors("write", path):
-        write_atomic(path, to_text(result).encode())
+    write_atomic(path, to_text(result).encode())
 
 
 def to_text(value: Any) -> str:

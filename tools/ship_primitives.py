@@ -22,7 +22,6 @@ from service.base import tensors
 from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
 from service.policies.numpy_policy import NumpyMCPPolicy
-from service.registry.blobs import BlobStore
 from service.registry.bundled import BUNDLED
 from service.registry.loading import read_stages
 from service.registry.manifest import acting_config
@@ -63,7 +62,7 @@ def ship(reference: str, source: Registry, target: Path) -> Version:
     shipped = manifest.model_copy(update={"version": number, "parent": None})
     model = target / "models" / name
     with os_errors("write", target):
-        digest = BlobStore(target / "blobs").put(tensors.encode(parameters))
+        digest = Registry(target).blobs.put(tensors.encode(parameters))
         assert digest == manifest.blob_sha256
         shutil.rmtree(model, ignore_errors=True)
         write_atomic(model / "versions" / str(number), shipped.to_bytes())

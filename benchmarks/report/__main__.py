@@ -119,8 +119,7 @@ class Report:
         for page, blocks in made.items():
             path = self._docs / page
             text = replace_blocks(path, {name: "\n\n".join(blocks[name]) for name in PAGES[page]})
-            with os_errors("write", path):
-                write_atomic(path, text.encode())
+            write_atomic(path, text.encode())
             self.files.append(path)
         self.files += write_results(self._results)
 

@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.report.markdown import Row, table
 from benchmarks.report.results import TRIAL, Result, by_method_and_task, read_trials
 from service.base.errors import TandemError
-from service.base.files import os_errors, write_atomic
+from service.base.files import write_atomic
 from service.envs.tasks import HARD_TASKS, TASKS, find_task
 from service.media.figures import BLUE, FAINT, GREEN, ORANGE, new_figure, save, style_axes
 from service.methods.task_evaluation import rate_of
@@ -56,8 +56,7 @@ def write_results(out: Path) -> list[Path]:
     """Write page and picture from every result in the directory."""
     found, page = read_trials(out / "downstream"), out / PAGE_FILE
     picture = draw_table(found, out / PICTURE_FILE)
-    with os_errors("write", page):
-        write_atomic(page, write_page(found, PICTURE_FILE).encode())
+    write_atomic(page, write_page(found, PICTURE_FILE).encode())
     return [page, picture]
 
 

@@ -25,7 +25,7 @@ from benchmarks.run_files import (
     paths_m,
     unthin,
 )  # fmt: skip
-from service.base.files import os_errors, write_atomic
+from service.base.files import write_atomic
 from service.base.jsonl import JsonlWriter
 from service.base.types import StateArray
 from service.config import WorkspaceConfig
@@ -168,8 +168,7 @@ def draw_goals(run: Run, path: Path) -> Path:
         for record in run["goals"]:
             goals.append(record)
         picture = plot_goals(directory, workspace).read_bytes()
-    with os_errors("write", path):
-        write_atomic(path, picture)
+    write_atomic(path, picture)
     return path
 
 

@@ -10,8 +10,7 @@ from benchmarks.report.markdown import Row, duration, millions, percent, table
 from benchmarks.run_files import RANDOM, STAGES, Records, Run, binned, mean_share, steps_until, unthin
 from service.config.self_play import SelfPlayConfig
 from service.registry.bundled import BUNDLED
-from service.registry.digest import parameters_digest
-from service.registry.loading import load
+from service.registry.loading import load, parameters_digest
 
 NUM_BINS = 10
 """Equal parts of a run's env steps; rates are those of the last, distances and heights also those of the first."""

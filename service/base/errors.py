@@ -1,8 +1,9 @@
-"""Every error that a user can mend."""
+"""Every error that a user can mend, among them the packages that only some commands need."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import ClassVar
 
 TRACEBACK_PREFIX = "tandem-error-"
@@ -166,3 +167,28 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     plain = {each.lower().replace("_", "-"): each for each in known}
     found = get_close_matches(name[:200].lower().replace("_", "-"), plain, n=1)
     return f"; did you mean {plain[found[0]]!r}?" if found else ""
+
+
+@contextmanager
+def needs_extra(extra: str, what: str) -> Iterator[None]:
+    """Say which extra to install where an import of the block does not find its package.
+
+    What the message says to type names the project, not an index or a clone: pip and uv take the one that is installed,
+    and add its extra.
+
+    Args:
+        extra: of ``pyproject.toml``, such as ``serve``.
+        what: needs it; the message begins with that.
+
+    Raises:
+        TandemError: a package is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package in ("", "service"):  # a mistake of ours
+            raise
+        raise TandemError(
+            f"{what} needs the package {package}, which is not installed: pip install 'tandem-skills[{extra}]'"
+        ) from None

@@ -79,15 +79,19 @@ def _descriptor(path: Path, flags: int, *, follow: bool) -> int:
     return descriptor
 
 
-def write_atomic(path: Path, data: bytes, *, flush: bool = True) -> None:
+def write_atomic(path: Path, data: bytes, error_type: type[StorageError] = StorageError, *, flush: bool = True) -> None:
     """Put ``data`` at ``path``, replacing what was there in one step; the directory is made when missing.
 
-    Without ``flush``, it does not wait for the disk, and a power cut may leave an older content or none.
+    Args:
+        path: of the file.
+        data: all that it holds then.
+        error_type: of the error.
+        flush: whether to wait for the disk; without that, a power cut may leave an older content or none.
 
     Raises:
-        OSError: the disk is full, or the directory cannot be written; ``path`` is then as it was.
+        StorageError: the disk is full, or the directory cannot be written; ``path`` is then as it was.
     """
-    with _temporary(path, data, flush=flush) as temporary:
+    with os_errors("write", path, error_type), _temporary(path, data, flush=flush) as temporary:
         temporary.replace(path)
         if flush:
             _flush_directory(path.parent)
@@ -97,9 +101,9 @@ def write_exclusive(path: Path, data: bytes) -> bool:
     """Put ``data`` at ``path`` unless something is there; True when it was put. One of many racing writers wins.
 
     Raises:
-        OSError: as for `write_atomic`, or the file system has no hard links.
+        StorageError: as for `write_atomic`, or the file system has no hard links.
     """
-    with _temporary(path, data) as temporary:
+    with os_errors("write", path), _temporary(path, data) as temporary:
         try:
             os.link(temporary, path)
         except FileExistsError:

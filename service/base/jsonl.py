@@ -124,8 +124,7 @@ class JsonlWriter(Appender):
         self.extent = Extent.of(kept)
         if self.path.exists():
             self.take_new_file()
-            with os_errors("write", self.path):
-                write_atomic(self.path, kept)  # also the same bytes: see Appender
+            write_atomic(self.path, kept)  # also the same bytes: see Appender
 
 
 def _read(path: Path, *, missing_ok: bool = False) -> bytes:

@@ -160,7 +160,7 @@ def _players(trained: Trained, method: str | None) -> dict[str, DeterministicPol
 
 def _write_result(path: Path, trained: Trained, method: str | None, seed: int, numbers: Metrics) -> None:
     """Write a file that says what a run's configuration and result say."""
-    from service.base.files import os_errors, write_atomic
+    from service.base.files import write_atomic
     from service.methods.task_methods import METHODS
     from service.store.run_directory import encode_result
 
@@ -176,8 +176,7 @@ def _write_result(path: Path, trained: Trained, method: str | None, seed: int, n
         "env_steps": 0,
         "wall_s": 0.0,
     }
-    with os_errors("write", path):
-        write_atomic(path, encode_result(result))
+    write_atomic(path, encode_result(result))
 
 
 def coverage(

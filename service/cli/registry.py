@@ -161,7 +161,7 @@ def card(
     directory: RegistryOption = REGISTRY,
 ) -> None:
     """Write a model card for a hub: what a version is, how it was trained, how good it is, how to load it."""
-    from service.base.files import os_errors, write_atomic
+    from service.base.files import write_atomic
     from service.registry.card import model_card
 
     registry, version = _found(reference, directory)
@@ -169,8 +169,7 @@ def card(
     if out is None:
         typer.echo(text, nl=False)
         return
-    with os_errors("write", out):
-        write_atomic(out, text.encode())
+    write_atomic(out, text.encode())
     typer.echo(f"the card of {version} is in {out}")
 
 

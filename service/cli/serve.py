@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from service.base.extras import needs_extra
+from service.base.errors import StatusError, needs_extra
 from service.cli.common import (
     REGISTRY,
     SOURCE,
@@ -39,7 +39,6 @@ def serve(
     quiet: QuietOption = False,
 ) -> None:
     """Show finished and running runs and the registry over REST, to Prometheus, and to a browser."""
-    from service.base.errors import StatusError
     from service.base.ports import DEFAULT_PORT, free_port
     from service.registry.registry import Registry
     from service.registry.token import VARIABLE, read_token

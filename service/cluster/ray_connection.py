@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from service.base.errors import TandemError, one_line
-from service.base.extras import needs_extra
+from service.base.errors import TandemError, needs_extra, one_line
 from service.base.ports import DEFAULT_PORT
 from service.base.progress import answer, doing
 from service.methods.method import WorkersError

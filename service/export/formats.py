@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from service.base.errors import ExportError, did_you_mean
-from service.base.extras import needs_extra
+from service.base.errors import ExportError, did_you_mean, needs_extra
 from service.base.types import FloatArray
 from service.export.networks import Network, Outputs
 from service.policies import forward
@@ -50,7 +49,7 @@ def find_format(name: str) -> Format:
 
     Raises:
         ExportError: no such format.
-        MissingPackageError: packages that it needs are not installed.
+        TandemError: packages that it needs are not installed.
     """
     if name not in FORMATS:
         raise ExportError(f"unknown format {name!r}; choose one of {', '.join(FORMATS)}{did_you_mean(name, FORMATS)}")

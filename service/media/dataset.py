@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from service.base.errors import TandemError
-from service.base.extras import needs_extra
+from service.base.errors import TandemError, needs_extra
 from service.base.files import os_errors
 from service.base.progress import counted
 from service.base.types import FloatArray, StateArray
@@ -66,8 +65,7 @@ def check_name(name: str) -> str:
     """The identifier of a new data set: ``name``, with ``-v0`` where it says no version.
 
     Raises:
-        TandemError: no name, or that of a data set that is there.
-        MissingPackageError: Minari is not installed.
+        TandemError: no name, or that of a data set that is there; or Minari is not installed.
     """
     full = name if re.search(r"-v[0-9]+$", name) else f"{name}-v0"
     if not _NAME.fullmatch(full):
@@ -97,8 +95,7 @@ def write_dataset(name: str, played: Sequence[Played], config: Config, label: st
         The data set's directory.
 
     Raises:
-        TandemError: a name that is none or taken, or a place that cannot be written.
-        MissingPackageError: Minari is not installed.
+        TandemError: a name that is none or taken, or a place that cannot be written; or Minari is not installed.
     """
     full = check_name(name)
     place = _place(full)

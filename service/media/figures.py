@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from service.base.errors import TandemError
-from service.base.files import os_errors, write_atomic
+from service.base.files import write_atomic
 from service.base.jsonl import read_jsonl
 from service.base.types import StateArray
 
@@ -63,8 +63,7 @@ def save(figure: Figure, path: Path) -> Path:
     """
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
-    with os_errors("write", path):
-        write_atomic(path, buffer.getvalue())
+    write_atomic(path, buffer.getvalue())
     return path
 
 

@@ -32,9 +32,7 @@ class BlobStore:
         try:
             self.get(digest)
         except DamagedBlobError:  # or not there yet
-            path = self.path(digest)
-            with os_errors("write", path):
-                write_atomic(path, data)
+            write_atomic(self.path(digest), data)
         return digest
 
     def get(self, digest: str) -> bytes:

@@ -69,6 +69,8 @@ def is_exported(path: Path) -> bool:
 class ExportedVersion(Registry):
     """The version in a directory, under the name and number that it has in the registry it comes from.
 
+    It is found by its reference, and in no list: aliases are not exported.
+
     Args:
         root: the directory.
 
@@ -76,28 +78,14 @@ class ExportedVersion(Registry):
         StorageError: its manifest is damaged, or cannot be read.
     """
 
+    is_only_read = True
+
     def __init__(self, root: Path) -> None:
         super().__init__(root)
         self._file = root / EXPORTED_MANIFEST
         manifest = read_manifest(self._file)
         self.version = Version(manifest.name, manifest.version)
-        self._blobs = _OneBlob(root)
-
-    def check_writable(self) -> None:
-        """Refuse: see ``Registry.check_writable``."""
-        raise self.only_read()
-
-    def names(self) -> list[str]:
-        """The version's name."""
-        return [self.version.name]
-
-    def versions(self, name: str) -> list[Version]:
-        """The version, if that is its name."""
-        return [self.version] if name == self.version.name else []
-
-    def aliases(self, name: str) -> dict[str, int]:
-        """None: aliases are not exported."""
-        return {}
+        self.blobs = _OneBlob(root)
 
     def _manifest_path(self, version: Version) -> Path:
         return self._file if version == self.version else super()._manifest_path(version)

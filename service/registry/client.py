@@ -13,11 +13,11 @@ from service.base.errors import (
     TandemError,
     UnknownVersionError,
     WrongTokenError,
+    needs_extra,
     one_line,
 )
-from service.base.extras import needs_extra
-from service.base.files import os_errors, write_atomic
-from service.registry.blobs import BlobStore, check_digest
+from service.base.files import write_atomic
+from service.registry.blobs import check_digest
 from service.registry.manifest import parse_manifest
 from service.registry.names import Version, split_reference
 from service.registry.registry import Registry
@@ -71,16 +71,15 @@ def fetch_primitives(
             raise DamagedBlobError(
                 f"{base} gave the manifest of {manifest.reference} for {reference}; check its registry"
             )
-        digest, blobs = manifest.blob_sha256, BlobStore(registry.root / "blobs")
+        digest = manifest.blob_sha256
         try:
-            blobs.get(digest)
+            registry.blobs.get(digest)
         except DamagedBlobError:  # or not there yet
             data = _get(service, f"/v1/blobs/sha256/{digest}")
             check_digest(f"{manifest.reference} from {base}", data, digest)
-            blobs.put(data)
+            registry.blobs.put(data)
     path = registry.root / "models" / name / "versions" / str(manifest.version)
-    with os_errors("write", path):  # after its parameters: a version that is listed can be loaded
-        write_atomic(path, manifest.to_bytes())
+    write_atomic(path, manifest.to_bytes())  # after its parameters: a version that is listed can be loaded
     return registry, Version(name, manifest.version)
 
 

@@ -6,14 +6,18 @@ Acting is NumPy: nothing here needs torch.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+import operator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
 from service.base.errors import ConfigError, TandemError
 from service.base.tensors import digest_of, split_parts
-from service.base.types import FloatArray
+from service.base.types import Array, FloatArray
 from service.config import Config, WorldConfig
 from service.config.skills import SkillDiscoveryConfig
 from service.config.task import TaskConfig
@@ -24,7 +28,6 @@ from service.policies.numpy_actor import numpy_actor
 from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy, NumpyPolicy, numpy_bob
 from service.policies.parameters import Parameters, PolicyError
 from service.registry.bundled import BUNDLED, find_version, is_bundled, is_exported
-from service.registry.digest import parameters_digest
 from service.registry.learned import LearnedPolicy
 from service.registry.manifest import Manifest, acting_config
 from service.store.checkpoints import Checkpoint, CheckpointStore, read_checkpoint
@@ -373,3 +376,29 @@ def _find_frozen(label: str, name: str, digest: str, place: tuple[Path | str, st
         f"{label} acts with {name} of digest {digest[:_SHOWN]}, which is not here: {problems[0]}; "
         "name it with --primitives, or the registry that has it with --registry"
     )
+
+
+def parameters_digest(policy: NumpyPolicy | FrozenSkills) -> str:
+    """SHA-256 of every array that a policy or skills act by: the same before and after they were used.
+
+    Recorded results and saved orchestrators hold it.
+    """
+    digest = hashlib.sha256()
+    for name, array in sorted(_recorded(policy), key=operator.itemgetter(0)):
+        digest.update(f"{name} {array.dtype} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _recorded(policy: NumpyPolicy | FrozenSkills) -> Iterator[tuple[str, Array]]:
+    """Arrays by the names that they had when the first digests were recorded."""
+    if not isinstance(policy, NumpyPolicy):
+        for owner, layers in (("._actor._layers", policy.actor.network["layers"]), ("._network", policy.network)):
+            for place, pair in enumerate(layers):
+                yield from ((f"{owner}._layers.{place}.{number}", array) for number, array in enumerate(pair))
+        return
+    for name, array in policy.network.items():
+        if not isinstance(array, list):  # of layers, which are there one by one, too
+            plain = name.replace("primitives.hidden", "primitives.head").replace("weight_floor", "floor")
+            parts = plain.replace("output_", "").split(".")
+            path = "".join(f"._layers.{part}" if part.isdigit() else f"._{part}" for part in parts)
+            yield path, array[:, None] if name == "primitives.output_bias" else array

@@ -42,9 +42,12 @@ Check = Callable[[Manifest, Mapping[str, np.ndarray]], Iterable[str]]
 class Registry:
     """Named, versioned parameters in the directory ``root``; any number of processes may publish and read at once."""
 
+    is_only_read = False
+    """Whether it is, also without the file that marks one."""
+
     def __init__(self, root: Path) -> None:
         self.root = root
-        self._blobs = BlobStore(root / "blobs")
+        self.blobs = BlobStore(root / "blobs")
 
     def check_writable(self) -> None:
         """Check that this registry may be written.
@@ -52,15 +55,12 @@ class Registry:
         Raises:
             RegistryError: it is marked as only read, as the one that comes with tandem is.
         """
-        if (self.root / READ_ONLY_FILE).exists():  # a file: it is found through whatever path leads to the directory
-            raise self.only_read()
-
-    def only_read(self) -> RegistryError:
-        """Make the error of a write to a registry that is only read."""
-        return RegistryError(
-            f"cannot write {self.root}: this registry is only read; "
-            "name another directory with --registry or TANDEM_REGISTRY"
-        )
+        # a file: it is found through whatever path leads to the directory
+        if self.is_only_read or (self.root / READ_ONLY_FILE).exists():
+            raise RegistryError(
+                f"cannot write {self.root}: this registry is only read; "
+                "name another directory with --registry or TANDEM_REGISTRY"
+            )
 
     def publish(
         self,
@@ -141,7 +141,7 @@ class Registry:
             StorageError: as for `manifest`; DamagedBlobError also for damaged parameters.
         """
         manifest = self.manifest(reference)
-        return manifest, tensors.decode(self._blobs.get(manifest.blob_sha256))
+        return manifest, tensors.decode(self.blobs.get(manifest.blob_sha256))
 
     def names(self) -> list[str]:
         """Every name that has a version, sorted.
@@ -217,15 +217,14 @@ class Registry:
         """
         manifest, _ = self.load(reference)
         files = {
-            directory / EXPORTED_PARAMETERS: self._blobs.get(manifest.blob_sha256),
+            directory / EXPORTED_PARAMETERS: self.blobs.get(manifest.blob_sha256),
             directory / EXPORTED_MANIFEST: manifest.to_bytes(),
         }
         for path in files:
             if path.exists():
                 raise RegistryError(f"cannot export {manifest.reference}: {path} exists; choose another directory")
-        with os_errors("write", directory):
-            for path, data in files.items():
-                write_atomic(path, data)
+        for path, data in files.items():
+            write_atomic(path, data)
         return manifest
 
     def _publish_version(self, name: str, parameters: Mapping[str, np.ndarray], fields: dict[str, Any]) -> Version:
@@ -235,14 +234,13 @@ class Registry:
             raise RegistryError(f"cannot publish {name}: {error}") from None
         fields |= {"blob_sha256": sha256_of(data), "blob_bytes": len(data)}
         make_manifest({**fields, "version": 1})  # a bad value must be found before anything is written
-        self._blobs.put(data)
+        self.blobs.put(data)
         while True:
             # unique: only one writer makes number n; contiguous: no writer tries n + 1 before n is there
             version = Version(name, max((last.number for last in self.versions(name)), default=0) + 1)
             path = self._manifest_path(version)
-            with os_errors("write", path):
-                if write_exclusive(path, make_manifest({**fields, "version": version.number}).to_bytes()):
-                    return version
+            if write_exclusive(path, make_manifest({**fields, "version": version.number}).to_bytes()):
+                return version
 
     def _read_alias(self, name: str, alias: str) -> int | None:
         """The number ``alias`` means; None when there is no such alias."""

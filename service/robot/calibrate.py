@@ -16,7 +16,7 @@ import yaml
 from pydantic import Field, ValidationError
 
 from service.base.errors import RobotError, TandemError
-from service.base.files import os_errors, write_atomic
+from service.base.files import write_atomic
 from service.base.types import FloatArray, StateArray
 from service.config.frozen import FrozenModel, first_error
 from service.config.tree import read_yaml
@@ -146,8 +146,7 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
     Raises:
         TandemError: the file cannot be written.
     """
-    with os_errors("write", path):
-        write_atomic(path, yaml.safe_dump(calibration.model_dump(mode="json"), sort_keys=False).encode())
+    write_atomic(path, yaml.safe_dump(calibration.model_dump(mode="json"), sort_keys=False).encode())
 
 
 def read_calibration(path: Path) -> Calibration:

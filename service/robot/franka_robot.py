@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from service.base.errors import RobotError, TandemError, one_line
-from service.base.extras import needs_extra
+from service.base.errors import RobotError, TandemError, needs_extra, one_line
 from service.config.frozen import FrozenModel
 from service.config.world import Point, WorldConfig
 from service.robot.backends import Backend

@@ -14,8 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from service.base.errors import ConfigError, RobotError
-from service.base.extras import needs_extra
+from service.base.errors import ConfigError, RobotError, needs_extra
 from service.base.types import StateArray
 from service.config.frozen import FrozenModel
 from service.config.world import WorldConfig

@@ -289,8 +289,7 @@ class Study:
         self._put(self.file, study.model_dump_json(indent=1) + "\n")
 
     def _put(self, path: Path, text: str) -> None:
-        with os_errors("write", path):
-            write_atomic(path, text.encode())
+        write_atomic(path, text.encode())
 
     def _show(
         self, reader: DiskReader, shown: dict[str, int], configs: Mapping[str, Config], progress: Progress

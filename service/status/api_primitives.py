@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import os
 from functools import lru_cache
-from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as InPath
 
 from service.base.errors import DamagedBlobError, FormatVersionError, RegistryError
-from service.registry.blobs import BlobStore
 from service.registry.bundled import BUNDLED, find_version, is_bundled
 from service.registry.manifest import Manifest
 from service.registry.names import NAME_PATTERN, Version
 from service.registry.registry import Registry
 from service.status.files import BYTES, PARTS, file_response
-from service.status.openapi import INVALID, READ_ONLY, problems
-from service.status.problems import ProblemError
+from service.status.problems import INVALID, READ_ONLY, ProblemError, problems
 from service.status.schemas import (
     AliasChange,
     AliasState,
@@ -48,9 +45,9 @@ def primitives_router(registry: Registry) -> APIRouter:
     shelf = Shelf(registry)
 
     @lru_cache(MAX_VERIFIED)
-    def verify(path: Path, digest: str, *_stamp: int) -> None:
+    def verify(place: Registry, digest: str, *_stamp: int) -> None:
         # once for each state of the file: clients cache blobs for ever, so a damaged one must never be served
-        BlobStore(path.parent.parent).get(digest)
+        place.blobs.get(digest)
 
     @router.get("/primitives", summary="All names")
     def list_primitives() -> PrimitiveList:
@@ -89,12 +86,12 @@ def primitives_router(registry: Registry) -> APIRouter:
     def get_blob(request: Request, digest: _Digest) -> Response:
         """Checked against the digest, which is also the entity tag; a blob never changes."""
         for place in reversed(shelf.registries.values()):
-            path = BlobStore(place.root / "blobs").path(digest)
+            path = place.blobs.path(digest)
             try:
                 status = os.stat(path)
             except FileNotFoundError:
                 continue
-            verify(path, digest, status.st_mtime_ns, status.st_size, status.st_ino)
+            verify(place, digest, status.st_mtime_ns, status.st_size, status.st_ino)
             return file_response(request, path, "application/octet-stream", etag=digest, cache=_FOREVER)
         raise ProblemError(404, "unknown-blob", f"no blob {digest} here; a manifest names the ones there are")
 

@@ -16,8 +16,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from service.base.errors import StoreError
 from service.status import run_details, series
 from service.status.files import BYTES, PARTS, RUN_FILES, RunDirectories, file_response, kind_of
-from service.status.openapi import INVALID, READ_ONLY, UNAVAILABLE, UNKNOWN_RUN, problems
-from service.status.problems import ProblemError
+from service.status.problems import INVALID, READ_ONLY, UNAVAILABLE, UNKNOWN_RUN, ProblemError, problems
 from service.status.schemas import (
     Axis,
     GoalFrames,

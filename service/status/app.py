@@ -1,32 +1,65 @@
-"""The ASGI app of the status service, used by ``tandem serve`` and by the Ray actor of a run."""
+"""The ASGI app of the status service, used by ``tandem serve`` and by the Ray actor of a run.
+
+Its routes about the service itself are here, too: is it well, ``/metrics``, the page, and the page's form to log in.
+"""
 
 from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
-from fastapi import FastAPI, Request
-from starlette.responses import Response
+from fastapi import APIRouter, FastAPI, Request, Response, Security
+from fastapi.security import APIKeyCookie, HTTPBearer
 from starlette.staticfiles import StaticFiles
 
-from service.base.errors import StatusError
+from service.base.errors import StatusError, TandemError
 from service.base.version import __version__
 from service.registry.registry import Registry
-from service.registry.token import VARIABLE, check_token
-from service.status import problems
+from service.registry.token import SESSION_COOKIE, VARIABLE, check_authorization, check_token, session_secret
 from service.status.api_primitives import primitives_router
 from service.status.api_runs import runs_router
-from service.status.api_service import service_router
-from service.status.auth import AuthMiddleware
+from service.status.auth import TRUSTED, AuthMiddleware
 from service.status.files import RunDirectories, file_response
-from service.status.metrics import Telemetry
-from service.status.openapi import COMMON, DESCRIPTION, SECURITY, DocumentedApp
-from service.status.problems import ProblemError
+from service.status.metrics import CONTENT_TYPE, Telemetry
+from service.status.problems import COMMON, INVALID, READ_ONLY, Problem, ProblemError, add_handlers, problems
+from service.status.schemas import ServiceState, TokenEntry
 from service.status.stream import Streams
 from service.store.models import RunReader
 
 PAGE = Path(__file__).parent / "page"
 """Directory of the web page: ``index.html`` is served at ``/``, all files under ``/page/``."""
+SESSION_S = 7 * 24 * 3600
+DESCRIPTION = """
+Runs, their progress, and primitives. Errors are `application/problem+json` (RFC 9457).
+On a public address every request but `/livez` needs the token; on any address those that change something need it.
+"""
+SECURITY = [
+    Security(HTTPBearer(description="The token the service was started with.", auto_error=False)),
+    Security(
+        APIKeyCookie(
+            name=SESSION_COOKIE, description="Set by POST /v1/session, for browsers; GET only.", auto_error=False
+        )
+    ),
+]
+"""Dependencies that only tell how to show the token; ``AuthMiddleware`` asks for it."""
+_NOT_READY = problems((503, "The runs or the registry cannot be read; the reason is given only with the token."))
+
+
+class DocumentedApp(FastAPI):
+    """An app whose document has the schema of errors, and parameters that can be left out but are never null."""
+
+    def openapi(self) -> dict[str, Any]:
+        """The OpenAPI document."""
+        tree = super().openapi()
+        problem = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+        tree["components"]["schemas"] |= {"Problem": problem, **problem.pop("$defs")}
+        for parameter in (
+            each for path in tree["paths"].values() for each in path.get("get", {}).get("parameters", ())
+        ):
+            schema = parameter["schema"]
+            schema |= schema.pop("anyOf", [{}])[0]
+        return tree
 
 
 def create_app(
@@ -66,7 +99,7 @@ def create_app(
         generate_unique_id_function=lambda route: route.name,
     )
     app.state.streams = streams
-    app.include_router(service_router(runs, registry, telemetry, token))
+    app.include_router(_service_router(runs, registry, telemetry, token))
     app.include_router(runs_router(runs, streams, RunDirectories(runs_dir), registry.root), dependencies=SECURITY)
     app.include_router(primitives_router(registry), dependencies=SECURITY)
 
@@ -79,9 +112,74 @@ def create_app(
         return file_response(request, _plotly(), "text/javascript")
 
     app.mount("/page", StaticFiles(directory=PAGE))
-    problems.add_handlers(app)
+    add_handlers(app)
     app.add_middleware(AuthMiddleware, token=token, public=public, observe=telemetry.observe)
     return app
+
+
+def _service_router(runs: RunReader, registry: Registry, telemetry: Telemetry, token: str | None) -> APIRouter:
+    """Make the routes for monitoring, and the one that gives a browser a cookie that reads."""
+    router = APIRouter(tags=["health"])
+
+    @router.get("/livez", summary="Whether the service answers")
+    async def livez() -> ServiceState:  # in the event loop: the threads may all wait for a file
+        """Needs no files and no Redis: a service that answers this need not be restarted."""
+        return ServiceState(status="alive")
+
+    @router.get("/readyz", summary="Whether runs and registry can be read", responses=_NOT_READY)
+    def readyz(request: Request) -> ServiceState:
+        """503 while something the service needs is unavailable."""
+        try:
+            runs.ready()
+            registry.names()
+        except (TandemError, OSError) as error:
+            trusted = request.scope.get(TRUSTED, False)
+            raise ProblemError(
+                503, "not-ready", str(error) if trusted else "not ready; ask with the token why"
+            ) from None
+        return ServiceState(status="ready")
+
+    @router.get("/healthz", summary="The same as /readyz", responses=_NOT_READY)
+    def healthz(request: Request) -> ServiceState:
+        """An older name of /readyz."""
+        return readyz(request)
+
+    @router.get(
+        "/metrics",
+        summary="For Prometheus",
+        dependencies=SECURITY,
+        response_class=Response,
+        responses={
+            200: {"content": {"text/plain": {"schema": {"type": "string"}}}, "description": "Prometheus' text format"}
+        },
+    )
+    def metrics() -> Response:
+        """Metrics of active and recently ended runs, the registry, and this service; see docs/operations.md."""
+        return Response(telemetry.page(), media_type=CONTENT_TYPE)
+
+    @router.post(
+        "/v1/session",
+        summary="Log a browser in",
+        responses=problems(INVALID, READ_ONLY),
+    )
+    async def open_session(entry: TokenEntry, request: Request, response: Response) -> ServiceState:
+        """Sets a cookie for this browser, with which it may read; it does not hold the token, and ends with it."""
+        if token is None:
+            raise ProblemError(403, "read-only", "this service has no token: everybody on its machine may read")
+        if check_authorization(f"Bearer {entry.token}", token) != "right":
+            said = "wrong token: enter the one that this service was started with"
+            raise ProblemError(401, "wrong-token", said, {"WWW-Authenticate": 'Bearer realm="tandem"'})
+        response.set_cookie(
+            SESSION_COOKIE,
+            session_secret(token),
+            max_age=SESSION_S,
+            httponly=True,
+            samesite="strict",
+            secure=request.headers.get("x-forwarded-proto") == "https",
+        )
+        return ServiceState(status="open")
+
+    return router
 
 
 def _plotly() -> Path:

@@ -12,8 +12,7 @@ from fastapi import Request
 from starlette.responses import FileResponse, Response
 from starlette.staticfiles import NotModifiedResponse, StaticFiles
 
-from service.status.openapi import problems
-from service.status.problems import ProblemError
+from service.status.problems import ProblemError, problems
 from service.status.schemas import RunFile
 from service.store.disk_reader import run_directories
 from service.store.run_directory import RECORDINGS

@@ -1,4 +1,7 @@
-"""Errors in the format of RFC 9457: all that is not a success is ``application/problem+json``, without a trace."""
+"""Errors in the format of RFC 9457: all that is not a success is ``application/problem+json``, without a trace.
+
+FastAPI does not know of them: what its document says of a route's errors is made here, too.
+"""
 
 from __future__ import annotations
 
@@ -77,6 +80,26 @@ class ProblemError(Exception):
         return JSONResponse(content, self.problem.status, self.headers, MEDIA_TYPE)
 
 
+_CONTENT = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+
+
+def problems(*texts: tuple[int, str]) -> dict[int | str, dict[str, Any]]:
+    """The ``responses=`` argument of a route for its own errors: (status, description) each."""
+    return {status: {"description": text, "content": _CONTENT} for status, text in texts}
+
+
+COMMON = problems(
+    (400, "The request is malformed HTTP."),
+    (401, "A token is needed, or it is the wrong one."),
+    (413, "The body is too large."),
+    (421, "The host is not localhost."),
+    (500, "A file of the service is damaged, or the service failed."),
+)
+"""Errors of every route."""
+UNKNOWN_RUN = (404, "There is no such run.")
+UNAVAILABLE = (503, "The runs cannot be read at the moment.")
+INVALID = (422, "The request does not match this document.")
+READ_ONLY = (403, "This service has no token and so changes nothing.")
 _KINDS: tuple[tuple[type[TandemError], int, str], ...] = (
     (UnknownRunError, 404, "unknown-run"),
     (UnknownVersionError, 404, "unknown-version"),

@@ -19,6 +19,8 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TypeVar
 
+from typing_extensions import override
+
 from service.base.errors import StoreUnavailableError, UnknownRunError
 from service.store.address import RedisAddress, address_from_environment
 from service.store.disk_reader import DiskReader
@@ -45,23 +47,23 @@ def open_reader(runs_dir: Path, redis: RedisAddress | None = None) -> RunReader:
     return CombinedReader(DiskReader(runs_dir), RedisReader(address))
 
 
-class CombinedReader:
-    """The ``RunReader`` of run directories and a Redis; thread-safe. Nothing is read before the first call."""
+class CombinedReader(RunReader):
+    """The runs of run directories and of a Redis; thread-safe. Nothing is read before the first call."""
 
     def __init__(self, disk: RunReader, redis: RunReader, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._disk, self._redis, self._clock = disk, redis, clock
         self._failure: tuple[float, str] | None = None
         """Time and reason of the last failure of Redis; None while it answers."""
 
+    @override
     def runs(self) -> list[RunStatus]:
-        """All runs, newest start first."""
         on_disk = {run.run_id: run for run in self._disk.runs()}
         in_redis = {run.run_id: run for run in self._ask_redis(self._redis.runs) or ()}
         merged = [self._merge(on_disk.get(run_id), in_redis.get(run_id)) for run_id in on_disk.keys() | in_redis.keys()]
         return sorted(merged, key=lambda run: (run.started, run.run_id), reverse=True)
 
+    @override
     def run(self, run_id: str) -> RunStatus:
-        """One run."""
         in_redis = self._ask_redis(lambda: self._redis.run(run_id))
         try:
             return self._merge(self._disk.run(run_id), in_redis)
@@ -70,31 +72,32 @@ class CombinedReader:
                 raise
             return in_redis
 
+    @override
     def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
-        """The records of iterations above ``after_iteration``, in order."""
         return self._disk_first(lambda reader: reader.metrics(run_id, after_iteration=after_iteration))
 
+    @override
     def columns(self, run_id: str, names: Sequence[str] | None) -> Columns:
-        """These metrics of all iterations."""
         return self._disk_first(lambda reader: reader.columns(run_id, names))
 
+    @override
     def sample(self, run_id: str, name: str, number: int) -> list[float | None]:
-        """One metric of about ``number`` records, evenly over the run."""
         return self._disk_first(lambda reader: reader.sample(run_id, name, number))
 
+    @override
     def goals(self, run_id: str) -> GoalGrid | None:
-        """The newest grid; None before the first."""
         return self._disk_first(lambda reader: reader.goals(run_id))
 
+    @override
     def request_stop(self, run_id: str) -> None:
-        """Ask a run to end after its current iteration; nothing happens if it has ended."""
         self.run(run_id)  # or raise UnknownRunError
         self._ask_redis(lambda: self._redis.request_stop(run_id))
         with suppress(UnknownRunError):  # of a run on another machine
             self._disk.request_stop(run_id)
 
+    @override
     def ready(self) -> None:
-        """Return if the directories can be read; Redis is not needed."""
+        """Redis is not needed."""
         self._disk.ready()
 
     def _merge(self, on_disk: RunStatus | None, in_redis: RunStatus | None) -> RunStatus:

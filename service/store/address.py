@@ -23,8 +23,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
-from service.base.errors import StoreError, StoreUnavailableError
-from service.base.extras import needs_extra
+from service.base.errors import StoreError, StoreUnavailableError, needs_extra
 
 VARIABLE = "TANDEM_REDIS_URL"
 RUNS = "tandem:runs"

@@ -98,8 +98,7 @@ class CheckpointStore:
         content = {"format_version": FORMAT_VERSION, "step": step, "meta": dict(meta)}
         digest = tensors.digest_of(json.dumps(content, sort_keys=True), arrays)
         data = tensors.encode(arrays, {_HEADER_KEY: json.dumps({**content, "sha256": digest}, sort_keys=True)})
-        with os_errors("write", path, CheckpointError):
-            write_atomic(path, data)
+        write_atomic(path, data, CheckpointError)
         self._prune(step)
         return path
 

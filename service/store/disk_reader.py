@@ -11,6 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from threading import Lock
 
+from typing_extensions import override
+
 from service.base.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError, one_line
 from service.base.files import read_regular
 from service.base.lock import holder, is_locked, newest_epoch
@@ -27,6 +29,7 @@ from service.store.models import (
     GoalGrid,
     Pulse,
     Record,
+    RunReader,
     RunStatus,
 )
 from service.store.run_history import FILE as RUN_FILE
@@ -80,8 +83,8 @@ def run_directories(root: Path) -> dict[str, Path]:
     return {run_id_of(path): path for path in reversed([*filter(_is_run, found), *inner])}
 
 
-class DiskReader:
-    """The ``RunReader``, which see for errors, of a directory of run directories; for any number of threads at once."""
+class DiskReader(RunReader):
+    """The runs of a directory of run directories; for any number of threads at once."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -93,22 +96,23 @@ class DiskReader:
         self._pulse = Pulse()
         self._lock = Lock()
 
+    @override
     def runs(self) -> list[RunStatus]:
-        """All runs, newest start first."""
         statuses = [self._status(run_id, path) for run_id, path in self._list().items()]
         return sorted(statuses, key=lambda status: status.started, reverse=True)
 
+    @override
     def run(self, run_id: str) -> RunStatus:
-        """One run."""
         return self._status(run_id, self._find(run_id))
 
+    @override
     def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
-        """The records of iterations above ``after_iteration``, in order."""
         with self._using(run_id) as path:
             return self._records_of(path).after(after_iteration)
 
+    @override
     def columns(self, run_id: str, names: Sequence[str] | None) -> Columns:
-        """These metrics of all iterations; what was read stays in memory, up to ``MAX_COLUMN_BYTES`` of all runs."""
+        """What was read stays in memory, up to ``MAX_COLUMN_BYTES`` of all runs."""
         with self._using(run_id) as path:
             records = self._records_of(path)
             found = records.columns(names)
@@ -118,13 +122,13 @@ class DiskReader:
                 self._in_columns.pop(0).forget()
         return found
 
+    @override
     def sample(self, run_id: str, name: str, number: int) -> list[float | None]:
-        """One metric of about ``number`` records, evenly over the file."""
         with self._using(run_id) as path:
             return self._records_of(path).sample(name, number)
 
+    @override
     def goals(self, run_id: str) -> GoalGrid | None:
-        """The newest grid; None before the first."""
         with self._using(run_id) as path:
             try:
                 return parse_with(GoalGrid.model_validate_json, read_regular(path / GOALS_FILE, MAX_BYTES), path)
@@ -135,14 +139,14 @@ class DiskReader:
                     f"{path / GOALS_FILE} is no goal grid; delete it, a run writes it anew"
                 ) from None
 
+    @override
     def request_stop(self, run_id: str) -> None:
-        """Ask a run to end after its current iteration; nothing happens if it has ended."""
         with self._using(run_id) as path:
             if self._status(run_id, path).state in ACTIVE:
                 (path / STOP_FILE).touch()
 
+    @override
     def ready(self) -> None:
-        """Return if the directory can be read."""
         self._list()
 
     def _status(self, run_id: str, path: Path) -> RunStatus:

@@ -12,11 +12,12 @@ Metrics are in ``metrics.jsonl``, where the run writes them for itself.
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol, Self, get_args
+from typing import Literal, NamedTuple, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,24 +184,19 @@ class Pulse:
         self._seen: dict[str, tuple[datetime, float, float]] = {}
         """By run: its heartbeat, and the clock at that and at the last look."""
 
-    def age_s(self, run_id: str, heartbeat: datetime) -> float:
-        """Seconds since a run's last heartbeat; never negative."""
-        by_date = max(0.0, (datetime.now(UTC) - heartbeat).total_seconds())
-        now_s = self._clock()
-        last, beat_s, looked_s = self._seen.get(run_id, (heartbeat, now_s - by_date, now_s))
-        if heartbeat != last:  # it came at some time since the last look
-            beat_s = max(now_s - by_date, looked_s)
-        self._seen[run_id] = heartbeat, beat_s, now_s
-        return now_s - beat_s
-
     def look(self, status: RunStatus) -> tuple[RunStatus, float]:
-        """The status of a run, and how long ago it was heard of; one from the future has a warning."""
-        age_s = self.age_s(status.run_id, status.heartbeat)
-        ahead = status.heartbeat - datetime.now(UTC)
-        if status.state in ACTIVE and ahead > MAX_AHEAD:
-            text = f"its heartbeat is {ahead.total_seconds():.0f} s in the future: the clock of its machine, or the one"
+        """The status of a run, a warning in one from the future; and seconds since it was heard of, never negative."""
+        heartbeat, now_s = status.heartbeat, self._clock()
+        age = datetime.now(UTC) - heartbeat
+        begun_s = now_s - max(0.0, age.total_seconds())
+        last, beat_s, looked_s = self._seen.get(status.run_id, (heartbeat, begun_s, now_s))
+        if heartbeat != last:  # it came at some time since the last look
+            beat_s = max(begun_s, looked_s)
+        self._seen[status.run_id] = heartbeat, beat_s, now_s
+        if status.state in ACTIVE and -age > MAX_AHEAD:
+            text = f"its heartbeat is {-age.total_seconds():.0f} s in the future: the clock of its machine, or the one"
             status = status.suffering("clock", f"{text} here, is wrong")
-        return status, age_s
+        return status, now_s - beat_s
 
 
 class GoalCell(FrozenModel):
@@ -225,33 +221,41 @@ class GoalGrid(FrozenModel):
     cells: tuple[GoalCell, ...]
 
 
-class RunReader(Protocol):
+class RunReader(ABC):
     """A place the status service reads runs from.
 
     Every method may raise ``StoreUnavailableError``, and ``DamagedStoreError`` where the store holds what no run has
     written. Those that take a run id raise ``UnknownRunError`` where there is no such run.
     """
 
+    @abstractmethod
     def runs(self) -> list[RunStatus]:
         """All runs, newest start first."""
 
+    @abstractmethod
     def run(self, run_id: str) -> RunStatus:
         """One run."""
 
+    @abstractmethod
     def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
         """The records of iterations above ``after_iteration``, in order, each iteration once (a resumed run's last)."""
 
+    @abstractmethod
     def columns(self, run_id: str, names: Sequence[str] | None) -> Columns:
         """These metrics of all iterations, None for all metrics; those that the run does not have are left out."""
 
+    @abstractmethod
     def sample(self, run_id: str, name: str, number: int) -> list[float | None]:
         """One metric of about ``number`` records, evenly over the run: fast, whatever else the run has recorded."""
 
+    @abstractmethod
     def goals(self, run_id: str) -> GoalGrid | None:
         """The newest grid; None before the first."""
 
+    @abstractmethod
     def request_stop(self, run_id: str) -> None:
         """Ask a run to end after its current iteration, saved; nothing happens if it has ended."""
 
+    @abstractmethod
     def ready(self) -> None:
         """Return if reads work right now."""

@@ -5,18 +5,20 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
+from typing_extensions import override
+
 from service.base.errors import DamagedStoreError, UnknownRunError
 from service.base.parsing import ParseError, parse_with
 from service.store.address import RUNS, Content, RedisAddress, run_key
-from service.store.models import ACTIVE, SILENT_AFTER, Columns, GoalGrid, Pulse, Record, RunStatus
+from service.store.models import ACTIVE, SILENT_AFTER, Columns, GoalGrid, Pulse, Record, RunReader, RunStatus
 from service.store.tail import Table, parse_record
 
 TIMEOUT_S = 0.5
 _logger = logging.getLogger(__name__)
 
 
-class RedisReader:
-    """The ``RunReader``, which see for errors, of a Redis; for any number of threads at once.
+class RedisReader(RunReader):
+    """The runs that report to a Redis; for any number of threads at once.
 
     ``StoreUnavailableError`` is raised after ``TIMEOUT_S`` at the latest.
     """
@@ -26,8 +28,9 @@ class RedisReader:
         self._client = address.client(TIMEOUT_S)
         self._pulse = Pulse()
 
+    @override
     def runs(self) -> list[RunStatus]:
-        """All runs, newest start first; one with a damaged status is left out."""
+        """One with a damaged status is left out."""
         statuses = []
         for run_id, *values in self._look_up(self._run_ids()):
             try:
@@ -36,29 +39,29 @@ class RedisReader:
                 _logger.warning("%s", error)
         return sorted(statuses, key=lambda status: status.started, reverse=True)
 
+    @override
     def run(self, run_id: str) -> RunStatus:
-        """One run."""
         ((_, text, *flags),) = self._look_up([run_id])
         if text is None:
             raise UnknownRunError.of(run_id, self._address, sorted(self._run_ids()))
         return self._status(run_id, text, *flags)
 
+    @override
     def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
-        """The records of iterations above ``after_iteration``, in order."""
         self.run(run_id)  # or raise UnknownRunError
         with self._address.errors():
             lines = self._client.zrangebyscore(run_key(run_id, "metrics"), f"({after_iteration}", "+inf")
         return [record for record in map(parse_record, lines) if record is not None]
 
+    @override
     def columns(self, run_id: str, names: Sequence[str] | None) -> Columns:
-        """These metrics of all iterations that Redis keeps."""
         table = Table()
         for record in self.metrics(run_id):
             table.add(record)
         return table.columns(names)
 
+    @override
     def sample(self, run_id: str, name: str, number: int) -> list[float | None]:
-        """One metric of about ``number`` records, evenly over those that Redis keeps."""
         self.run(run_id)  # or raise UnknownRunError
         key = run_key(run_id, "metrics")
         with self._address.errors(), self._client.pipeline(transaction=False) as pipe:
@@ -68,8 +71,8 @@ class RedisReader:
             records = [parse_record(line[0]) for line in pipe.execute() if line]
         return [record.get(name) for record in records if record is not None]
 
+    @override
     def goals(self, run_id: str) -> GoalGrid | None:
-        """The newest grid; None before the first."""
         self.run(run_id)  # or raise UnknownRunError
         with self._address.errors():
             text = self._client.get(run_key(run_id, "goals"))
@@ -78,14 +81,14 @@ class RedisReader:
         except ParseError:
             raise _damaged(run_key(run_id, "goals"), "goal grid") from None
 
+    @override
     def request_stop(self, run_id: str) -> None:
-        """Ask a run to end after its current iteration; nothing happens if it has ended."""
         if self.run(run_id).state in ACTIVE:
             with self._address.errors():
                 self._client.set(run_key(run_id, "stop"), b"1")
 
+    @override
     def ready(self) -> None:
-        """Return if Redis answers."""
         with self._address.errors():
             self._client.ping()
 

@@ -48,7 +48,15 @@ from service.base.types import FloatArray, StateArray
 from service.base.version import git_commit
 from service.config import Config, dump_config, load_config
 from service.store.checkpoints import CheckpointStore
-from service.store.run_history import FIRST_VERSION, RunHistory, is_of_this_version, read_history, read_note, written_by
+from service.store.run_history import (
+    FIRST_VERSION,
+    Event,
+    RunHistory,
+    is_of_this_version,
+    read_history,
+    read_note,
+    written_by,
+)
 
 if TYPE_CHECKING:
     from service.base.tensorboard import EventFile
@@ -166,16 +174,19 @@ class RunDirectory:
                 writer.cut_after(resumption.iteration)
             else:
                 writer.cut(resumption.records[writer.path.name].num_bytes)
-        with os_errors("write", self.path):
-            after_step = resumption.num_env_steps if resumption is not None else None
-            self._events = EventFile(self.path / "tensorboard", after_step=after_step)
-            if resumption is not None:
-                said = [f"{name} {what}" for name, what in self._damaged.items()]
-                at = datetime.now(UTC)
-                self.history = self.history.with_event(at, resumption.iteration, resumption.changed, said)
-            self.history.write(self.path)
-            write_atomic(self.path / "environment.json", json.dumps(_environment(), indent=1).encode())
-            write_atomic(self.config_file, dump_config(config).encode())  # last: a start that failed can be tried again
+        after_step = resumption.num_env_steps if resumption is not None else None
+        self._events = EventFile(self.path / "tensorboard", after_step=after_step)
+        if resumption is not None and (resumption.changed or self._damaged):
+            event = Event(
+                at=datetime.now(UTC),
+                after_iteration=resumption.iteration,
+                changed=resumption.changed,
+                damaged_records=tuple(f"{name} {what}" for name, what in self._damaged.items()),
+            )
+            self.history = self.history.model_copy(update={"events": (*self.history.events, event)})
+        self.history.write(self.path)
+        write_atomic(self.path / "environment.json", json.dumps(_environment(), indent=1).encode())
+        write_atomic(self.config_file, dump_config(config).encode())  # last: a start that failed can be tried again
 
     def read_published(self) -> Published | None:
         """What this run published last; None before the first.
@@ -205,9 +216,7 @@ class RunDirectory:
         Raises:
             StorageError: it cannot be written.
         """
-        path = self.path / RESULT_FILE
-        with os_errors("write", path):
-            write_atomic(path, encode_result(result))
+        write_atomic(self.path / RESULT_FILE, encode_result(result))
 
     def write_published(self, published: Published) -> None:
         """Note what this run published.
@@ -215,8 +224,7 @@ class RunDirectory:
         Raises:
             StorageError: it cannot be written.
         """
-        with os_errors("write", self.published_file):
-            write_atomic(self.published_file, json.dumps(published._asdict()).encode())
+        write_atomic(self.published_file, json.dumps(published._asdict()).encode())
 
     def claim(self, *, resume: bool) -> None:
         """Keep every other process from running this run until ``close``; a second call does nothing.
@@ -314,7 +322,7 @@ class RunDirectory:
         path, data = self.diverged / f"round-{name}.npz", io.BytesIO()
         np.savez(data, states=np.stack(states), actions=np.stack(actions))
         _logger.warning("physics diverged in %d worlds, which go on from sound states; see %s", len(states), path)
-        with self.keep_running(self.diverged), os_errors("write", path):
+        with self.keep_running(self.diverged):
             write_atomic(path, data.getvalue())
 
     def sync(self) -> dict[str, Extent]:

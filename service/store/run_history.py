@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable
-from datetime import datetime
 from pathlib import Path
 from typing import TypeVar
 
@@ -44,20 +43,11 @@ class RunHistory(FrozenModel):
         """The history of a run that begins."""
         return cls(run=secrets.token_hex(16), tandem=__version__)
 
-    def with_event(
-        self, at: datetime, after_iteration: int, changed: dict[str, tuple[JsonValue, JsonValue]], damaged: list[str]
-    ) -> RunHistory:
-        """The history after a process has gone on; the same where everything was as before."""
-        if not changed and not damaged:
-            return self
-        event = Event(at=at, after_iteration=after_iteration, changed=changed, damaged_records=tuple(damaged))
-        return self.model_copy(update={"events": (*self.events, event)})
-
     def write(self, directory: Path) -> None:
         """Put it into a run directory.
 
         Raises:
-            OSError: it cannot be written.
+            StorageError: it cannot be written.
         """
         write_atomic(directory / FILE, self.model_dump_json(indent=1).encode() + b"\n")
 

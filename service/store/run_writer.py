@@ -140,6 +140,6 @@ class _LatestFile:
         if content is None:
             return
         self._written_s = self._clock()
-        with self._directory.keep_running(self._path), os_errors("write", self._path):
+        with self._directory.keep_running(self._path):
             write_atomic(self._path, content.model_dump_json().encode() + b"\n", flush=False)
             self._waiting = None

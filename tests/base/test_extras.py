@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.base.extras import MissingPackageError, needs_extra
+from service.base.errors import TandemError, needs_extra
 from service.cli.main import app
 from tests.runs.runs import assert_one_line
 
@@ -49,7 +49,7 @@ def test_a_command_says_which_one_to_install(tmp_path, monkeypatch, without, pac
 
 def test_what_fetches_says_which_one_to_install(without):
     without("httpx", ours=["service.registry.client"])
-    with pytest.raises(MissingPackageError) as error:
+    with pytest.raises(TandemError) as error:
         import_module("service.registry.client")
     assert_one_line(error.value, "fetching primitives needs the package httpx", "'tandem-skills[serve]'")
 
@@ -64,6 +64,6 @@ def test_every_extra_that_a_command_needs_is_named_somewhere():
 def test_a_module_of_ours_that_is_missing_is_no_extra():
     with pytest.raises(ModuleNotFoundError) as error, needs_extra("serve", "this"):
         import_module("service.nothing")
-    assert not isinstance(error.value, MissingPackageError)
-    with pytest.raises(MissingPackageError, match=r"^this needs the package nothing, which"), needs_extra("x", "this"):
+    assert not isinstance(error.value, TandemError)
+    with pytest.raises(TandemError, match=r"^this needs the package nothing, which"), needs_extra("x", "this"):
         import_module("nothing.at.all")

@@ -12,8 +12,7 @@ from benchmarks.push_range import DIRECTIONS, best_pushes, positions_behind
 from service.config import load_config
 from service.learner.learner import Learner
 from service.policies.numpy_policy import numpy_bob
-from service.registry.digest import parameters_digest
-from service.registry.loading import Trained
+from service.registry.loading import Trained, parameters_digest
 
 
 def two_primitives(*bias):

@@ -16,7 +16,7 @@ from benchmarks.report.__main__ import ABOUT_THE_RECIPE, PAGES, Report, begin, e
 from benchmarks.report.recipe import SHIPPED, check_words, differences, recipe_words
 from service.base.errors import TandemError
 from service.config import load_config
-from service.registry.digest import parameters_digest
+from service.registry.loading import parameters_digest
 
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -13,7 +13,7 @@ import service
 from service.cli.main import app
 from service.cli.registry import registry_app
 from service.registry.bundled import BUNDLED
-from service.registry.digest import parameters_digest
+from service.registry.loading import parameters_digest
 from service.registry.manifest import parse_manifest
 from service.registry.registry import Registry
 from tests.registry.helpers import Publish, files_in

@@ -6,8 +6,7 @@ import traceback
 
 import pytest
 
-from service.base.errors import StoreError, StoreUnavailableError
-from service.base.extras import MissingPackageError
+from service.base.errors import StoreError, StoreUnavailableError, TandemError
 from service.store.address import RedisAddress, address_from_environment
 from service.store.redis_reader import RedisReader
 from tests.runs.runs import assert_one_line
@@ -72,6 +71,6 @@ def test_a_wrong_password_and_none(redis):
 
 def test_the_package_is_missing(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "redis.connection", None)
-    with pytest.raises(MissingPackageError) as error:
+    with pytest.raises(TandemError) as error:
         RedisAddress("redis://localhost")
     assert_one_line(error.value, "TANDEM_REDIS_URL is set", "pip install 'tandem-skills[cluster]'")

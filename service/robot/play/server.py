@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from service.base import ports
-from service.base.errors import TandemError
-from service.base.extras import needs_extra
+from service.base.errors import TandemError, needs_extra
 from service.registry.loading import Trained
 from service.robot.play.game import Game
 from service.robot.play.page import LiveScene, Panel
