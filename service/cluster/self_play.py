@@ -35,7 +35,7 @@ from service.actors.rollout import MAX_POLICY_LAG, from_arrays
 from service.base.errors import DivergedError
 from service.base.types import Metrics
 from service.cluster.actor_pool import ActorPool, ActorSlot
-from service.cluster.iteration import OpenIteration, Round, may_begin, may_update
+from service.cluster.iteration import OpenIteration, Round, may_begin, may_update, take_copies
 from service.cluster.ray_actors import GeneratorActor, LearnerActor, remote_actor
 from service.cluster.ray_connection import ClusterOptions, last_line
 from service.cluster.remote_worker import POLL_S, RemoteWorker, lost
@@ -134,7 +134,7 @@ class RaySelfPlay(SelfPlay):
         self._start_rounds()
         with self.timing("wait"):
             ready = self._wait()
-        self._take_copies(ready)
+        take_copies(self._copies, ready)
         for slot in list(self._pool):
             self._take_from_actor(slot, ready)
         ended = self._take_iteration(ready)
@@ -357,14 +357,6 @@ class RaySelfPlay(SelfPlay):
             self._opponents = opponents
         needed = [self._weights, self._snapshot, self._opponents, self._generator.state, self._learner.state]
         self._copies = {each: self._copies.get(each) for each in needed}
-
-    def _take_copies(self, ready: set[Any]) -> None:
-        """Copy to this node what can be: it outlives the node that it is from. Processes of one machine share it."""
-        for reference in self._copies.keys() & ready:
-            try:
-                self._copies[reference] = ray.get(reference)
-            except RayError:  # it went with its node, and who needs it will say so
-                del self._copies[reference]
 
     # --- looking after workers -------------------------------------------------------------------------------------
 
