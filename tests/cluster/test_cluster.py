@@ -4,7 +4,7 @@ import os
 import re
 import signal
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -226,8 +226,15 @@ def test_workers_that_are_killed_are_replaced_and_no_others(tmp_path, monkeypatc
 
 def test_workers_that_hang_are_replaced_and_one_that_is_late_is_not(tmp_path, monkeypatch):
     """Iterations wait for learner and generator, and no round is lost by that; they do not wait for an actor."""
-    monkeypatch.setattr(watch, "STALL_S", 6.0)
+    monkeypatch.setattr(watch, "STALL_S", 10.0)
     frozen, played, errors, said = {}, {"generator": [], "learner": []}, [], []
+
+    def bounded(slot, stall_s):
+        """Let it hang after that time; a bound holds from the end of a round on."""
+        monkeypatch.setattr(watch, "STALL_S", stall_s)
+        until = slot.num_rollouts + 2
+        while slot.num_rollouts < until:
+            yield
 
     def freeze(run):
         method = run.method
@@ -240,7 +247,9 @@ def test_workers_that_hang_are_replaced_and_one_that_is_late_is_not(tmp_path, mo
         incarnations = [actor.incarnation for actor in workers_of(run).values()]
         assert incarnations == [0, 0, 1, 1]
 
-        late, (slot, _) = send(run, "rollout-0", signal.SIGSTOP), method._pool
+        slot, _ = method._pool
+        yield from bounded(slot, 600.0)  # however long these iterations take, it is only late
+        late = send(run, "rollout-0", signal.SIGSTOP)
         while not slot.late:  # iterations go on without it
             yield
         said.extend(method.health().warnings)
@@ -250,7 +259,7 @@ def test_workers_that_hang_are_replaced_and_one_that_is_late_is_not(tmp_path, mo
         while slot.late or not method.health().num_rollouts_refused:
             yield
         assert workers_of(run)["rollout-0"].incarnation == 0
-        yield from all_there(run, 1)
+        yield from bounded(slot, 10.0)
         frozen["rollout-0"] = send(run, "rollout-0", signal.SIGSTOP)
         assert frozen["rollout-0"] == late
         yield from all_there(run, 1, [late])
@@ -303,6 +312,22 @@ def test_what_is_lost_or_cannot_be_mended(monkeypatch):
             what()
         assert_one_line(str(error.value).strip().splitlines()[-1], said)
 
+    @contextmanager
+    def replaced(name, value):
+        """Give rounds this value, also after an iteration that was on its way has handed out another."""
+        hand_out, kept = method._hand_out, [getattr(method, name)]
+
+        def hand_out_and_replace(**changes):
+            hand_out(**changes)
+            kept[0] = getattr(method, name)
+            setattr(method, name, value)
+
+        method._hand_out = hand_out_and_replace
+        setattr(method, name, value)
+        yield
+        method._hand_out = hand_out
+        setattr(method, name, kept[0])
+
     try:
         method.start()
         learn(2)
@@ -314,13 +339,12 @@ def test_what_is_lost_or_cannot_be_mended(monkeypatch):
         fails(StateLostError, "newest state is lost", method.state)
         method._generator.state = state
 
-        snapshot, method._snapshot = method._snapshot, lost_object()
-        fails(StateLostError, "goes back to its newest checkpoint", lambda: learn(5))  # its actor is not to blame
-        weights, method._snapshot = method._weights, snapshot
-        bob = {name: np.full_like(array, np.nan) for name, array in ray.get(weights).bob.items()}
-        method._weights = ray.put(replace(ray.get(weights), bob=bob))
-        fails(PolicyError, "is not finite", lambda: learn(5))
-        method._weights = weights
+        with replaced("_snapshot", lost_object()):  # its actor is not to blame
+            fails(StateLostError, "goes back to its newest checkpoint", lambda: learn(100))
+        weights = ray.get(method._weights)
+        bob = {name: np.full_like(array, np.nan) for name, array in weights.bob.items()}
+        with replaced("_weights", ray.put(replace(weights, bob=bob))):
+            fails(PolicyError, "is not finite", lambda: learn(100))
         learn(1)
 
         # As when the machine of all actors loses power before the learner has got what it held.

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from multiprocessing import get_context
 
 import pytest
 
@@ -25,18 +26,18 @@ def die():
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def killed(work):
-    """Let a child of this process do ``work``; it has to die of it."""
-    child = os.fork()
-    if child == 0:
-        signal.alarm(600)
-        try:
-            work()
-        finally:
-            os._exit(1)
-    _, status = os.waitpid(child, 0)
-    assert os.WIFSIGNALED(status), f"exit status {status}"
-    assert os.WTERMSIG(status) == signal.SIGKILL
+def killed(moment, path, *, resume=False):
+    """Let another process play until it dies of the moment. It is no fork: this one may have threads of Ray's."""
+    process = get_context("spawn").Process(target=_play_until, args=(moment, path, resume))
+    process.start()
+    process.join(600)
+    assert process.exitcode == -signal.SIGKILL
+
+
+def _play_until(moment, path, resume):
+    with pytest.MonkeyPatch.context() as patch:
+        moment(patch)
+        play(path, resume=resume)
 
 
 def elsewhere(path, to):
@@ -96,10 +97,8 @@ MOMENTS = {
 
 
 @pytest.mark.parametrize(("moment", "saved"), MOMENTS.items(), ids=lambda each: getattr(each, "__name__", None))
-def test_a_run_that_is_killed_and_goes_on_elsewhere(uninterrupted, tmp_path, monkeypatch, moment, saved):
-    with monkeypatch.context() as patch:
-        moment(patch)
-        killed(lambda: play(tmp_path / "run"))
+def test_a_run_that_is_killed_and_goes_on_elsewhere(uninterrupted, tmp_path, moment, saved):
+    killed(moment, tmp_path / "run")
     assert newest(tmp_path / "run").step == saved
     path = elsewhere(tmp_path / "run", tmp_path / "other" / "place")
     _, result = play(path, resume=True)
@@ -110,10 +109,8 @@ def test_a_run_that_is_killed_and_goes_on_elsewhere(uninterrupted, tmp_path, mon
     assert list(path.rglob(".tmp-*")) == []
 
 
-def test_a_resume_that_is_killed_while_it_cuts_the_records(uninterrupted, tmp_path, monkeypatch):
+def while_records_are_cut(patch):
     """One file is cut and the other is not."""
-    path = tmp_path / "run"
-    play(path, kill_after=3)
     cut = JsonlWriter.cut
 
     def cut_one(self, num_bytes):
@@ -121,9 +118,13 @@ def test_a_resume_that_is_killed_while_it_cuts_the_records(uninterrupted, tmp_pa
             die()
         cut(self, num_bytes)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(JsonlWriter, "cut", cut_one)
-        killed(lambda: play(path, resume=True))
+    patch.setattr(JsonlWriter, "cut", cut_one)
+
+
+def test_a_resume_that_is_killed_while_it_cuts_the_records(uninterrupted, tmp_path):
+    path = tmp_path / "run"
+    play(path, kill_after=3)
+    killed(while_records_are_cut, path, resume=True)
     play(path, resume=True)
     assert_same_run(path, uninterrupted)
 

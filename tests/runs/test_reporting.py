@@ -1,10 +1,10 @@
 """What a run in one process tells while it goes on, and that only one process runs it."""
 
 import json
-import os
 import signal
 import threading
 import time
+from multiprocessing import get_context
 
 import httpx
 import pytest
@@ -182,21 +182,17 @@ def test_a_run_that_another_took_over_stops_at_once_and_leaves_its_status_alone(
 
 def test_a_second_process_is_refused_and_a_killed_one_has_vanished(tmp_path):
     path, reader = tmp_path / "runs" / "cube", DiskReader(tmp_path / "runs")
-    child = os.fork()
-    if child == 0:
-        try:
-            run(tmp_path, tiny_config(total_env_steps=10**9))
-        finally:
-            os._exit(1)
+    other = get_context("spawn").Process(target=run, args=(tmp_path, tiny_config(total_env_steps=10**9)))
+    other.start()
     try:
         wait_until(lambda: path.exists() and reader.runs() and reader.run("cube").iteration > 0, within_s=600.0)
         assert reader.run("cube").state == "running"
         with pytest.raises(RunTakenError) as error:
             RunDirectory(path).claim(resume=True)
-        assert_one_line(error.value, f"{path} is in use by process {child}", "--run-dir")
+        assert_one_line(error.value, f"{path} is in use by process {other.pid}", "--run-dir")
     finally:
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
+        other.kill()
+        other.join()
     told = json.loads((path / "status.json").read_text())
     (path / "status.json").write_text(json.dumps(told | {"heartbeat": "2024-05-01T00:00:00Z"}))
     seen = status(tmp_path)  # a reader who has seen it alive does not care for dates
