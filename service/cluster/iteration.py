@@ -8,9 +8,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-import ray
-from ray.exceptions import RayError
-
 from service.actors.rollout import MAX_POLICY_LAG
 from service.base.types import Metrics
 from service.methods.method import Iteration
@@ -75,17 +72,3 @@ def may_update(version: int, played: Iterable[int]) -> bool:
         played: versions of the rounds being played that updates wait for.
     """
     return all(version + 1 - each <= MAX_POLICY_LAG for each in played)
-
-
-def take_copies(copies: dict[Any, Any], ready: set[Any]) -> None:
-    """Copy to this node what can be: it outlives the node that it is from. Processes of one machine share it.
-
-    Args:
-        copies: by reference; None until it is here.
-        ready: references to what is there; one that was lost with its node is left out of the copies.
-    """
-    for reference in copies.keys() & ready:
-        try:
-            copies[reference] = ray.get(reference)
-        except RayError:  # who needs it will say so
-            del copies[reference]

@@ -154,3 +154,17 @@ class RemoteWorker:
 def lost(error: BaseException) -> bool:
     """Whether a call failed because an argument of it was lost with a node."""
     return isinstance(error, RayTaskError) and isinstance(error.cause, ObjectLostError)
+
+
+def take_copies(copies: dict[Any, Any], ready: set[Any]) -> None:
+    """Copy to this node what can be: it outlives the node that it is from. Processes of one machine share it.
+
+    Args:
+        copies: by reference; None until it is here.
+        ready: references to what is there; one that was lost with its node is left out of the copies.
+    """
+    for reference in copies.keys() & ready:
+        try:
+            copies[reference] = ray.get(reference)
+        except RayError:  # who needs it will say so
+            del copies[reference]

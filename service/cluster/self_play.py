@@ -35,10 +35,10 @@ from service.actors.rollout import MAX_POLICY_LAG, from_arrays
 from service.base.errors import DivergedError
 from service.base.types import Metrics
 from service.cluster.actor_pool import ActorPool, ActorSlot
-from service.cluster.iteration import OpenIteration, Round, may_begin, may_update, take_copies
+from service.cluster.iteration import OpenIteration, Round, may_begin, may_update
 from service.cluster.ray_actors import GeneratorActor, LearnerActor, remote_actor
 from service.cluster.ray_connection import ClusterOptions, last_line
-from service.cluster.remote_worker import POLL_S, RemoteWorker, lost
+from service.cluster.remote_worker import POLL_S, RemoteWorker, lost, take_copies
 from service.cluster.watch import Clock, RayletWatch
 from service.config.self_play import SelfPlayConfig
 from service.methods.method import Health, Iteration, State, StateLostError, WorkersError

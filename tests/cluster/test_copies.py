@@ -6,7 +6,7 @@ import ray
 from ray.cluster_utils import Cluster
 from ray.exceptions import ObjectLostError
 
-from service.cluster.iteration import take_copies
+from service.cluster.remote_worker import take_copies
 
 
 @ray.remote(max_retries=0)
