@@ -25,7 +25,7 @@ help:
 	@echo "make demo    a short pre-training from scratch: about five minutes, ends with what Bob has learned"
 	@echo "make test    ruff, mypy and every test: about five minutes, ends with how many passed"
 	@echo "make setup   make $(VENV) and install everything into it: about two minutes, 2.5 GB; the others do it first"
-	@echo "make check   ruff, mypy and the tests that are not slow: a minute and a half"
+	@echo "make check   ruff, mypy and the tests that are not slow: about a minute"
 	@echo "make docs    the docs site, into build/docs-site/site"
 	@echo "make bench   the throughput benchmarks, against panda-gym"
 	@echo "make clean   remove $(VENV) and the caches; runs/ stays"
