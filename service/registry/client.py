@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from contextlib import suppress
 from pathlib import Path
 
 from service.base.errors import (
@@ -17,6 +18,7 @@ from service.base.errors import (
     one_line,
 )
 from service.base.files import write_atomic
+from service.base.parsing import ParseError, parse_json
 from service.registry.blobs import check_digest
 from service.registry.manifest import parse_manifest
 from service.registry.names import Version, split_reference
@@ -99,18 +101,20 @@ def _get(service: httpx.Client, path: str) -> bytes:
 
 def _refusal(base: str, response: httpx.Response) -> TandemError:
     """The error in an answer that is not a success."""
-    kind = response.headers.get("content-type", "nothing")
-    if kind != "application/problem+json":
+    kind, problem = response.headers.get("content-type", "nothing"), None
+    if kind == "application/problem+json":
+        with suppress(ParseError):
+            problem = parse_json(response.content, base)
+    if not isinstance(problem, dict) or "detail" not in problem:
         return FetchError(
             f"{base} gave {response.status_code} and {one_line(kind, 60)}: is this the URL of a `tandem serve`?"
         )
-    problem = response.json()
-    detail = f"{base} says: {one_line(problem['detail'], 500)}"
+    detail = f"{base} says: {one_line(str(problem['detail']), 500)}"
     if response.status_code == httpx.codes.UNAUTHORIZED:
         return WrongTokenError(f"{detail}; set {VARIABLE} to it and {URL_VARIABLE} to this URL, or give token=")
-    if problem["type"] == "urn:tandem:unknown-version":
+    if problem.get("type") == "urn:tandem:unknown-version":
         return UnknownVersionError(detail)
-    if problem["type"] == "urn:tandem:damaged":
+    if problem.get("type") == "urn:tandem:damaged":
         return DamagedBlobError(detail)
     return FetchError(detail)
 

@@ -210,8 +210,12 @@ def test_no_service_at_the_url(home, tmp_path):
         ((200, "text/html", b"<h1>a router</h1>"), "not JSON"),
         ((404, "text/html", b"<h1>a router</h1>"), "404 and text/html"),
         ((302, "text/html", b""), "302"),
-        ((503, "application/problem+json", b'{"type": "x", "detail": "the store\\nis away"}'), "the store is away"),
+        ((500, "application/problem+json", b"{"), "500"),
+        ((503, "application/problem+json", b'{"detail": "the store\\nis away"}'), "the store is away"),
+        ((503, "application/problem+json", b'{"detail": "\\u001b]0;owned\\u0007"}'), r"\x1b]0;owned\x07"),
+        ((503, "application/problem+json", b"[" * 60_000), "503"),
         ((503, "text/\x1b[2J", b""), "503"),
+        ((200, "application/json", b"[" * 60_000), "nested more than 64 deep"),
         ((200, "application/json", b"[]"), "not a JSON object"),
     ],
 )
