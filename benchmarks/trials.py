@@ -16,15 +16,15 @@ from typing import Any
 
 from benchmarks.measuring import one_line_errors, write_json
 from benchmarks.report.results import FORMAT_VERSION, TRIAL, Result
-from service.actors.evaluation import DeterministicPolicy, IdlePolicy, evaluate, wilson_interval
+from service.actors.evaluation import DeterministicPolicy, IdlePolicy
 from service.base.errors import TandemError
 from service.base.jsonl import read_jsonl
 from service.base.version import git_commit
 from service.config.load import parse_config
 from service.config.task import TaskConfig
 from service.config.tree import apply_override
-from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
-from service.methods.task_evaluation import FINAL_SEED
+from service.envs.tasks import find_task
+from service.methods.task_evaluation import FINAL_SEED, evaluate_on, numbers_of
 from service.methods.task_methods import find_method
 from service.registry.loading import load
 from service.runs.train import train
@@ -64,22 +64,12 @@ def run_trial(config: TaskConfig, registry: Path, path: Path) -> Result:
 
 def _play(config: TaskConfig, registry: Path) -> dict[str, Any]:
     """What ``result.json`` has of a method that learns nothing."""
-    trained, task = load(config.primitives, registry), find_task(config.task)
-    player: DeterministicPolicy = IdlePolicy() if config.method == "idle" else trained.player()
-    found = evaluate(
-        player,
-        task.world_from(config.world),
-        task.goals,
-        num_episodes=config.run.final_episodes,
-        num_steps=EPISODE_STEPS,
-        success_distance_m=SUCCESS_DISTANCE_M,
-        seed=config.seed + FINAL_SEED,
-        num_threads=config.run.num_threads,
-    )
-    low, high = wilson_interval(round(found.success_ever * found.num_episodes), found.num_episodes)
-    evaluation = {**found.as_dict(), "success_ever_low": low, "success_ever_high": high}
+    idle = config.method == "idle"
+    player: DeterministicPolicy = IdlePolicy() if idle else load(config.primitives, registry).player()
+    num, seed = config.run.final_episodes, config.seed + FINAL_SEED
+    found = evaluate_on(config.task, config.world, player, num, seed, config.run.num_threads)
     made = {"git_commit": git_commit(), "num_cores": os.cpu_count()}
-    return {"evaluation": evaluation, "env_steps": 0, "wall_s": 0.0, "made": made}
+    return {"evaluation": numbers_of(found), "env_steps": 0, "wall_s": 0.0, "made": made}
 
 
 def _recorded(config: TaskConfig, registry: Path, result: dict[str, Any], records: Sequence[dict[str, Any]]) -> Result:
