@@ -51,7 +51,6 @@ from benchmarks.training_process import (
 from service.base.errors import TandemError
 from service.store.run_directory import RunDirectory
 
-PACKAGES = ("mujoco", "numpy", "torch")
 NUM_WORLDS = ("8", "240")
 _PLAY_WORLDS = """
 import json, sys
@@ -213,4 +212,4 @@ def report(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_benchmark("throughput", PACKAGES, __doc__, Settings, benchmark, report))
+    raise SystemExit(run_benchmark("throughput", __doc__, Settings, benchmark, report))

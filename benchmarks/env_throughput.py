@@ -42,7 +42,6 @@ COMPARED = (
     (ONE_WORLD, PICK_AND_PLACE),
     (ONE_WORLD, PUSH),
 )
-PACKAGES = ("mujoco", "numpy", "gymnasium", "panda-gym", "pybullet")
 _SUCCESS_M = 0.05
 _OPEN_STEPS = 8
 """After which a grasping arm closes its gripper."""
@@ -144,15 +143,13 @@ def panda_gym(name: str, *, grasping: bool = False) -> GymnasiumContender:
 
 
 def benchmark(settings: Settings) -> dict[str, Any]:
-    """Measure all rows in turn, after an episode each to warm up."""
+    """Measure all rows in turn."""
     return measure_rows(contenders(settings.num_worlds), settings)
 
 
 def measure_rows(rows: Mapping[str, BatchContender | GymnasiumContender], settings: Settings) -> dict[str, Any]:
     """Median rates of the given rows, and how many times as fast as panda-gym ours are; for JSON."""
     plays = {name: row.episode for name, row in rows.items()}
-    for play in plays.values():
-        play()
     samples = measure_in_turn(plays, settings.num_pairs, settings.seconds)
     ratios = {
         f"{ours} / {theirs}": ratio(samples[ours], samples[theirs])
@@ -169,4 +166,4 @@ def report(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_benchmark("env_throughput", PACKAGES, __doc__, Settings, benchmark, report))
+    raise SystemExit(run_benchmark("env_throughput", __doc__, Settings, benchmark, report))

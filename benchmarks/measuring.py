@@ -18,10 +18,11 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, asdict, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from benchmarks.report.markdown import table
 from service.base.errors import TandemError
@@ -31,8 +32,25 @@ from service.registry.loading import Trained, load
 
 ROOT = Path(__file__).parents[1]
 RECIPE_FILE = ROOT / "configs" / "pretrain" / "panda_cube.yaml"
+PACKAGES = ("mujoco", "numpy", "torch", "gymnasium", "ray", "redis", "panda-gym", "pybullet")
+"""Those on which measurements may depend."""
 _PLAIN_LIST = re.compile(r"\[[^\[\]{}]*\]")
 _Settings = TypeVar("_Settings")
+_Arguments = ParamSpec("_Arguments")
+
+
+def one_line_errors(main: Callable[_Arguments, int]) -> Callable[_Arguments, int]:
+    """A program that prints the one line of an error that a user can correct, and then ends with 2."""
+
+    @functools.wraps(main)
+    def program(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> int:
+        try:
+            return main(*args, **kwargs)
+        except TandemError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 2
+
+    return program
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +83,9 @@ def measure(play: Callable[[], int], seconds: float) -> Sample:
 
 
 def measure_in_turn(plays: Mapping[str, Callable[[], int]], num_pairs: int, seconds: float) -> dict[str, list[Sample]]:
-    """Measure each of ``plays`` for about ``seconds``, all of them in turn, ``num_pairs`` times."""
+    """Measure each of ``plays`` for about ``seconds``, all in turn, ``num_pairs`` times, after one each to warm up."""
+    for play in plays.values():
+        play()
     samples: dict[str, list[Sample]] = {name: [] for name in plays}
     for _ in range(num_pairs):
         for name, play in plays.items():
@@ -95,19 +115,19 @@ def ratio(ours: Sequence[Sample], theirs: Sequence[Sample]) -> dict[str, float]:
     return {"median": statistics.median(wall), "least": min(wall), "greatest": max(wall), "cpu": statistics.median(cpu)}
 
 
-def machine(*packages: str) -> dict[str, Any]:
-    """The commit, the processor, how busy it is with everything that runs on it, and versions of ``packages``."""
-    try:
-        versions = {name: importlib.metadata.version(name) for name in packages}
-    except importlib.metadata.PackageNotFoundError as error:
-        raise TandemError(f"{error.name} is not installed: run `make bench`, which installs it") from None
+def machine() -> dict[str, Any]:
+    """The commit, the processor, how busy it is with everything that runs on it, and versions of what is installed."""
+    versions = {"python": platform.python_version()}
+    for name in PACKAGES:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
     return {
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "git_commit": git_commit(),
         "cpu": _cpu_model(),
         "num_cpus": os.cpu_count(),
         "load_average": [round(load, 2) for load in os.getloadavg()],
-        "versions": {"python": platform.python_version(), **versions},
+        "versions": versions,
     }
 
 
@@ -167,9 +187,9 @@ def read_settings(doc: str | None, settings: type[_Settings]) -> tuple[_Settings
     return settings(**{name: tuple(each) if isinstance(each, list) else each for name, each in given.items()}), file
 
 
+@one_line_errors
 def run_benchmark(
     name: str,
-    packages: Sequence[str],
     doc: str | None,
     settings: type[_Settings],
     benchmark: Callable[[_Settings], dict[str, Any]],
@@ -180,7 +200,6 @@ def run_benchmark(
 
     Args:
         name: of the benchmark in its file; a result that has another one keeps it.
-        packages: those whose versions matter.
         doc: what ``--help`` says.
         settings: a dataclass, see ``read_settings``.
         benchmark: measures.
@@ -188,33 +207,14 @@ def run_benchmark(
         failed: whether the exit code is 1.
     """
     chosen, file = read_settings(doc, settings)
-
-    @one_line_errors
-    def program() -> int:
-        where = machine(*packages)
-        print(describe(where), flush=True)
-        head = {"benchmark": name, "machine": where, "settings": asdict(chosen)}  # type: ignore[call-overload]
-        result = head | benchmark(chosen)
-        if file is not None:
-            write_json(file, result)
-        print(report(result))
-        return int(failed(result))
-
-    return program()
-
-
-def one_line_errors(main: Callable[[], int]) -> Callable[[], int]:
-    """A program that prints the one line of an error that a user can correct, and then ends with 2."""
-
-    @functools.wraps(main)
-    def program() -> int:
-        try:
-            return main()
-        except TandemError as error:
-            print(f"error: {error}", file=sys.stderr)
-            return 2
-
-    return program
+    where = machine()
+    print(describe(where), flush=True)
+    head = {"benchmark": name, "machine": where, "settings": asdict(chosen)}  # type: ignore[call-overload]
+    result = head | benchmark(chosen)
+    if file is not None:
+        write_json(file, result)
+    print(report(result))
+    return int(failed(result))
 
 
 def of_each(

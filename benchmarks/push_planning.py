@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from service.policies.numpy_policy import NumpyMCPPolicy
     from service.registry.loading import Trained
 
-PACKAGES = ("mujoco", "numpy")
 _HELD_STEPS = 5
 """Env steps that weights are held in a plan."""
 _MARGIN_M = 0.01
@@ -133,4 +132,4 @@ def report(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_benchmark("push_planning", PACKAGES, __doc__, Settings, benchmark, report))
+    raise SystemExit(run_benchmark("push_planning", __doc__, Settings, benchmark, report))

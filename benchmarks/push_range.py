@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from service.registry.loading import Trained
 
-PACKAGES = ("numpy",)
 DIRECTIONS = {"+x": (1.0, 0.0), "-x": (-1.0, 0.0), "+y": (0.0, 1.0), "-y": (0.0, -1.0)}
 _RESTING_HEIGHT_M = 0.025
 """Height of the middle of a cube of 5 cm."""
@@ -104,4 +103,4 @@ def report(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_benchmark("push_range", PACKAGES, __doc__, Settings, benchmark, report))
+    raise SystemExit(run_benchmark("push_range", __doc__, Settings, benchmark, report))

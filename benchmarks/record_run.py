@@ -43,7 +43,6 @@ from service.store.run_directory import RunDirectory
 
 GOAL_RECORDS, GOALS_EACH = 60, 10
 """Stages of the run of which goals are kept, and the number of goals of each."""
-PACKAGES = ("mujoco", "numpy", "torch")
 NUM_SLICES = 30
 """Equal parts of a run's env steps."""
 BIN_M = 0.025
@@ -78,7 +77,7 @@ _Player = Callable[..., StateArray]
 
 def head_of(config: Config, name: str) -> Run:
     """What every file of a run begins with; ``name`` is for tables."""
-    recorded = machine(*PACKAGES)
+    recorded = machine()
     return {
         "format_version": FORMAT_VERSION, "name": name, "recorded": recorded, "config": config.model_dump(mode="json")
     }  # fmt: skip

@@ -38,7 +38,6 @@ from benchmarks.report.markdown import table
 from benchmarks.training_process import Records, environment, scratch
 from service.base.errors import TandemError
 
-PACKAGES = ("mujoco", "numpy", "torch")
 WORKTREE = "worktree"
 NOT_LEARNED = frozenset({"config", "format_version", "records", "run", "sha256", "wall_s"})
 """Keys of those plain values that say how, when and where; they may differ."""
@@ -251,4 +250,4 @@ def differs(result: dict[str, Any]) -> bool:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_benchmark("same_bits", PACKAGES, __doc__, Settings, benchmark, report, differs))
+    raise SystemExit(run_benchmark("same_bits", __doc__, Settings, benchmark, report, differs))

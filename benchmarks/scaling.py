@@ -30,8 +30,6 @@ from benchmarks.training_process import (
 from service.config.self_play import SelfPlayConfig
 from service.store.run_directory import RunDirectory
 
-PACKAGES = ("ray", "redis", "mujoco", "numpy", "torch")
-
 
 @dataclass(frozen=True, slots=True)
 class Settings:
@@ -117,4 +115,4 @@ def box_block(result: Mapping[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_benchmark("scaling_box", PACKAGES, __doc__, Settings, benchmark, box_block))
+    raise SystemExit(run_benchmark("scaling_box", __doc__, Settings, benchmark, box_block))

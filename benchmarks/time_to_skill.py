@@ -29,7 +29,6 @@ from service.runs.grid import parse_seeds
 SHARE = 0.9
 NUM_IN_A_ROW = 3
 SUCCESS = "evaluation/mixed_success_last"
-PACKAGES = ("mujoco", "numpy", "torch")
 
 
 def first_in_a_row(rates: Sequence[float]) -> int | None:
@@ -111,7 +110,7 @@ def main() -> int:
     done = {run["seed"] for run in result["runs"] if run["reached"] or run["max_env_steps"] >= budget}
     for seed in parse_seeds(given.seeds):
         if seed not in done:
-            where = machine(*PACKAGES)
+            where = machine()
             run = run_seed(RECIPE_FILE, given.set, seed, budget)
             others = [each for each in result["runs"] if each["seed"] != seed]
             result["runs"] = sorted([*others, run | {"machine": where}], key=lambda each: each["seed"])

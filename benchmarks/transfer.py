@@ -31,7 +31,6 @@ from service.robot.running import for_robot
 from service.robot.safety import SafetyConfig
 from service.robot.watchdogs import WatchConfig
 
-PACKAGES = ("pybullet", "mujoco", "numpy")
 Gain = tuple[float, float, float]
 CHUNK = 25
 """Goals of one engine."""
@@ -354,4 +353,4 @@ def _interval(each: Mapping[str, Any], name: str) -> str:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_benchmark("transfer", PACKAGES, __doc__, Settings, benchmark, transfer_table))
+    raise SystemExit(run_benchmark("transfer", __doc__, Settings, benchmark, transfer_table))

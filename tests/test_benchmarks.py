@@ -90,7 +90,7 @@ def test_a_benchmark_writes_what_it_measured_and_may_fail(monkeypatch, tmp_path,
     def measured(settings):
         return {"found": settings.one}
 
-    assert measuring.run_benchmark("some", (), None, Some, measured, str, lambda result: result["found"] == 3) == 1
+    assert measuring.run_benchmark("some", None, Some, measured, str, lambda result: result["found"] == 3) == 1
     written = json.loads((tmp_path / "out.json").read_text())
     assert (written["benchmark"], written["found"], written["settings"]["many"]) == ("some", 3, ["a"])
     assert "'found': 3" in capsys.readouterr().out
@@ -127,7 +127,7 @@ def test_without_panda_gym_one_line_says_how_to_get_it(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "panda_gym", None)
     monkeypatch.setattr(sys, "argv", ["env_throughput.py", "--num-worlds", "1"])
     given = (env_throughput.Settings, env_throughput.benchmark, env_throughput.report)
-    assert measuring.run_benchmark("env_throughput", (), None, *given) == 2
+    assert measuring.run_benchmark("env_throughput", None, *given) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "make bench" in error

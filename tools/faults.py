@@ -31,7 +31,6 @@ from service.store.models import RunStatus
 from tests.store.redis_server import RedisServer
 from tools.rollout_audit import audit_run
 
-PACKAGES = ("ray", "torch", "mujoco", "numpy")
 SMALL = {"game.num_worlds": 48, "run.checkpoint_interval": 10, "run.evaluation_interval": 0, "run.num_threads": 1}
 """A small game, so that rounds are short beside what is measured."""
 ARGUMENTS = ("--config", str(RECIPE_FILE), "--num-actors", "2", *overrides(ENDLESS | SMALL))
@@ -280,4 +279,4 @@ def missed(result: dict[str, Any]) -> bool:
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_benchmark("faults", PACKAGES, __doc__, Settings, benchmark, report, missed))
+    raise SystemExit(run_benchmark("faults", __doc__, Settings, benchmark, report, missed))
