@@ -59,7 +59,6 @@ def control_config(recipe: Path, name: str, seed: int, bob_steps: int, settings:
 def record_control(directory: RunDirectory, name: str, downstream: dict[str, Any]) -> Run:
     """Everything that is kept of a control whose run has ended; ``downstream`` has results of its trials by task."""
     config, records = directory.read_config(), read_records(directory.metrics_file)
-    kept = [{key: value for key, value in record.items() if key.startswith(_KEPT)} for record in records]
     bob = load(str(directory.path)).policy
     return head_of(config, f"{name}-{config.seed}") | {
         "control": name,
@@ -71,7 +70,7 @@ def record_control(directory: RunDirectory, name: str, downstream: dict[str, Any
             task: {key: result[key] for key in ("cell", "evaluation", "env_steps")}
             for task, result in downstream.items()
         },
-        "series": thin(kept, MAX_POINTS),
+        "series": thin(records, MAX_POINTS, _KEPT),
     }
 
 

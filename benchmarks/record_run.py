@@ -83,12 +83,11 @@ def head_of(config: Config, name: str) -> Run:
     }  # fmt: skip
 
 
-def record_run(directory: RunDirectory, name: str, note: str = "") -> Run:
-    """Everything that is kept of a run without measuring anything; ``name`` is for tables, ``note`` for people."""
+def record_run(directory: RunDirectory, name: str) -> Run:
+    """Everything that is kept of a run without measuring anything; ``name`` is for tables."""
     config = directory.read_config()
     goals = read_records(directory.goals_file)
     return head_of(config, name) | {
-        "note": note,
         "environment": _environment(directory),
         "series": thin(read_records(directory.metrics_file)),
         "curriculum": count_goals(goals, config.world.rest_height_m),
@@ -103,20 +102,15 @@ def measure_run(directory: RunDirectory) -> dict[str, Any]:
     return {"evaluations": measure_tasks(newest, config), "coverage": measure_coverage(bobs, config)}
 
 
-def record_skills(directory: RunDirectory, name: str, note: str = "") -> Run:
+def record_skills(directory: RunDirectory, name: str) -> Run:
     """Everything that is kept of a run of skills, or of self-play as skills."""
     config = directory.read_config()
     coverage = measure_coverage(read_stages(directory), config, num_steps=EPISODE_STEPS)
     if coverage is None:
         raise TandemError(f"{directory.path} has a monolithic Bob, who has no skills; name another run")
-    kept = [
-        {key: value for key, value in record.items() if key.startswith(KEPT_OF_SKILLS)}
-        for record in read_records(directory.metrics_file)
-    ]
     return head_of(config, name) | {
-        "note": note,
         "method": config.skills.method if isinstance(config, SkillDiscoveryConfig) else OURS,
-        "series": thin(kept, SKILL_POINTS),
+        "series": thin(read_records(directory.metrics_file), SKILL_POINTS, KEPT_OF_SKILLS),
         "coverage": coverage,
     }
 
@@ -168,7 +162,7 @@ def _environment(directory: RunDirectory) -> dict[str, Any]:
 
 
 def measure_tasks(
-    bob: DeterministicPolicy, config: Config, *, num_episodes: int = NUM_EPISODES, num_steps: int = NUM_STEPS
+    bob: DeterministicPolicy, config: Config, *, num_episodes: int = NUM_EPISODES
 ) -> list[dict[str, Any]]:
     """Bob without noise and a policy that does nothing, from fresh resets.
 
@@ -183,7 +177,7 @@ def measure_tasks(
                 task.world_from(config.world),
                 task.goals,
                 num_episodes=num_episodes,
-                num_steps=num_steps,
+                num_steps=NUM_STEPS,
                 success_distance_m=config.success_distance_m,
                 seed=SEED,
                 num_threads=config.run.num_threads,
@@ -246,14 +240,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
     parser.add_argument("--out", type=Path, metavar="FILE", required=True, help="its stem is the run's name")
-    parser.add_argument("--note", default="", help="a sentence for people")
     parser.add_argument("--skills", action="store_true", help="where its random skills take the object, and less else")
     given = parser.parse_args()
     directory, name = RunDirectory(given.run_dir), given.out.stem
-    if given.skills:
-        run = record_skills(directory, name, given.note)
-    else:
-        run = record_run(directory, name, given.note) | measure_run(directory)
+    run = record_skills(directory, name) if given.skills else record_run(directory, name) | measure_run(directory)
     write_json(given.out, run)
     print(f"{given.out}: {given.out.stat().st_size / 1000:.0f} kB")
     return 0

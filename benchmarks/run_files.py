@@ -31,10 +31,16 @@ Run = dict[str, Any]
 Records = Sequence[dict[str, Any]]
 
 
-def thin(records: Records, max_points: int = MAX_POINTS) -> dict[str, list[float | None]]:
-    """Each metric as a list of at most ``max_points`` means over equal blocks of records; null where none had it."""
+def thin(
+    records: Records, max_points: int = MAX_POINTS, kept: tuple[str, ...] = ("",)
+) -> dict[str, list[float | None]]:
+    """Each metric as a list of at most ``max_points`` means over equal blocks of records; null where none had it.
+
+    ``kept`` are the beginnings of the names of metrics that are kept.
+    """
     parts = blocks(len(records), max_points)
-    keys = sorted({key for record in records for key in record}, key=lambda key: (key not in COUNTERS, key))
+    names = {key for record in records for key in record if key.startswith(kept)}
+    keys = sorted(names, key=lambda key: (key not in COUNTERS, key))
     series = {}
     for key in keys:
         values = column(records, key)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from benchmarks.record_run import ASKED, ASKED_RATES, ASKED_STEPS, NUM_STEPS, TASKS
+from benchmarks.record_run import ASKED, ASKED_RATES, ASKED_STEPS, TASKS
 from benchmarks.report.markdown import Row, duration, millions, percent, table
 from benchmarks.run_files import RANDOM, STAGES, Records, Run, binned, mean_share, steps_until, unthin
 from service.config.self_play import SelfPlayConfig
@@ -45,7 +45,7 @@ def tasks_table(runs: Sequence[Run]) -> str:
     Bold is what is below what was asked.
     """
     head = ("run", *TASKS, f"env steps until {percent(ASKED)} of mixed")
-    rows = [(_label(run), *_judged(run["evaluations"]), _steps_to_asked(run)) for run in runs]
+    rows = [(str(run["name"]), *_judged(run["evaluations"]), _steps_to_asked(run)) for run in runs]
     idle = max((tasks_cells(run["evaluations"], idle=True) for run in runs), key=lambda cells: sum(map(bool, cells)))
     asked = (percent(ASKED_RATES[task]) for task in TASKS)
     return table(head, [*rows, ("asked for", *asked, millions(ASKED_STEPS)), ("doing nothing", *idle, "")])
@@ -122,12 +122,6 @@ def _at_end(records: Records, key: str) -> str:
 def _success(row: dict[str, Any]) -> str:
     low, high = (100 * row[f"success_last_{end}"] for end in ("low", "high"))
     return f"{percent(row['success_last'])} [{low:.0f}, {high:.0f}]"
-
-
-def _label(run: Run) -> str:
-    """The run's name, and the steps of its episodes where they are not the usual ones."""
-    steps = {row["num_steps"] for row in run["evaluations"]} - {NUM_STEPS}
-    return f"{run['name']} ({max(steps)} steps)" if steps else str(run["name"])
 
 
 def _steps_to_asked(run: Run) -> str:

@@ -25,8 +25,8 @@ def short(monkeypatch):
 def test_a_skill_run_is_recorded(tmp_path):
     config = small_config("dads", total_env_steps=400)
     play(tmp_path, config)
-    run = record_run.record_skills(RunDirectory(tmp_path), "dads-0", "a test")
-    assert (run["name"], run["note"], run["method"], run["config"]["seed"]) == ("dads-0", "a test", "dads", 0)
+    run = record_run.record_skills(RunDirectory(tmp_path), "dads-0")
+    assert (run["name"], run["method"], run["config"]["seed"]) == ("dads-0", "dads", 0)
     assert run["series"]["env_steps"][-1] == 400
     assert {name.partition("/")[0] for name in run["series"]} == {
         "iteration", "env_steps", "time", "evaluation", "skills"
