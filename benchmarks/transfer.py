@@ -36,6 +36,15 @@ CHUNK = 25
 """Goals of one engine."""
 SPEED_M_S, ACCELERATION_M_S2 = 1.7, 13.0
 """Limits of a Franka's Cartesian motion."""
+BRIDGE = BridgeConfig(
+    set_points_per_step=10,
+    safety=SafetyConfig(
+        max_speed_m_s=SPEED_M_S,
+        max_grip_force_n=140.0,  # a Franka hand's greatest: the cube is ten times as heavy as in training
+        watch=WatchConfig(max_state_age_s=0.2, max_pose_age_s=0.25),  # two steps late, and some more
+    ),
+)
+"""Of all rows."""
 _REST_STEPS = 4
 """More than the greatest delay of a row."""
 RESPONSES = (0.4, 0.55, 0.7, 0.85, 1.0)
@@ -45,8 +54,6 @@ RESPONSES = (0.4, 0.55, 0.7, 0.85, 1.0)
 class Settings:
     """What is played, and how it is brought to a robot."""
 
-    name: str = "transfer"
-    """Of the recorded file."""
     policy: str = "panda-cube@champion"
     larger: str = ""
     """Directory of an orchestrator for Larger; none by default, and then its row is not measured."""
@@ -56,11 +63,6 @@ class Settings:
     num_goals: int = 300
     num_steps: int = 50
     seed: int = 0
-    set_points_per_step: int = 10
-    max_speed_m_s: float = SPEED_M_S
-    max_acceleration_m_s2: float = SafetyConfig().max_acceleration_m_s2
-    grip_force_n: float = 140.0
-    """A Franka hand's greatest: the cube is ten times as heavy as in training, and half as rough."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,17 +126,6 @@ class Played:
     """Control steps in which the arm touches nothing, and those of them with the tip inside; none where unknown."""
 
 
-def bridge_config(settings: Settings) -> BridgeConfig:
-    """The bridge of all rows."""
-    safety = SafetyConfig(
-        max_speed_m_s=settings.max_speed_m_s,
-        max_acceleration_m_s2=settings.max_acceleration_m_s2,
-        max_grip_force_n=settings.grip_force_n,
-        watch=WatchConfig(max_state_age_s=0.2, max_pose_age_s=0.25),  # two steps late, and some more
-    )
-    return BridgeConfig(set_points_per_step=settings.set_points_per_step, safety=safety)
-
-
 def policy_of(row: Row, settings: Settings) -> Trained:
     """The policy of a row, in the world of its back-end."""
     found = for_robot(load(getattr(settings, row.policy), settings.registry))
@@ -152,7 +143,7 @@ def calibrate_row(row: Row, settings: Settings) -> Calibration:
         assert backend.simulator is not None
         x, y, _ = world.workspace.upper_m  # out of the way
         backend.simulator.reset(np.array([x, y, world.rest_height_m]))
-        return calibrate(row.backend, backend.robot, world, bridge_config(settings))
+        return calibrate(row.backend, backend.robot, world, BRIDGE)
     finally:
         backend.close()
 
@@ -214,15 +205,14 @@ def _play(policy: Trained, backend: Backend, goal: StateArray, settings: Setting
         tip.extend(step.get("measured_m", ()))
         set_points.extend(step.get("set_points_m", ()))
 
-    config, world = bridge_config(settings), policy.world
-    bridge = Bridge(policy.policy, backend.robot, backend.poses, world, config, gain=gain, record=record)
+    world, num = policy.world, BRIDGE.set_points_per_step
+    bridge = Bridge(policy.policy, backend.robot, backend.poses, world, BRIDGE, gain=gain, record=record)
     stopped = ""
     try:
         bridge.run(goal, settings.num_steps)
     except RobotError as error:
         stopped = str(error)
     last = float(np.linalg.norm(simulator.object_position() - goal))
-    num = config.set_points_per_step
     gap_s = world.physics_step_s * world.num_substeps / num
     insides = [_steps_inside(np.array(path), gap_s, num) for path in (tip, set_points)]
     free = np.diff(touches) == 0
@@ -296,9 +286,8 @@ def benchmark(settings: Settings) -> dict[str, Any]:
         seed=settings.seed,
     )
     return {
-        "benchmark": settings.name,
         "policy": {"label": policy.label, "digest": policy.digest},
-        "bridge": bridge_config(settings).model_dump(mode="json"),
+        "bridge": BRIDGE.model_dump(mode="json"),
         "engine": PyBulletParameters().model_dump(mode="json"),
         "rows": rows,
         "nominal_world": without.as_dict(),
@@ -323,11 +312,11 @@ def transfer_table(result: Mapping[str, Any]) -> str:
 
 def transfer_words(result: Mapping[str, Any]) -> str:
     """What was played, the motion of the tip, the stops, and where it was measured."""
-    rows, settings = result["rows"], result["settings"]
+    rows, safety = result["rows"], result["bridge"]["safety"]
     num_goals = sorted({row["num_goals"] for row in rows.values()})
     words = [
-        f"{result['policy']['label']}, {', '.join(map(str, num_goals))} goals a row, {settings['num_steps']} steps; "
-        "95 % Wilson intervals. In the nominal world of training and without the bridge it reaches "
+        f"{result['policy']['label']}, {', '.join(map(str, num_goals))} goals a row, {result['settings']['num_steps']} "
+        "steps; 95 % Wilson intervals. In the nominal world of training and without the bridge it reaches "
         f"{percent(result['nominal_world']['success_last'], 1)} of such goals."
     ]
     if LIMITED in rows:
@@ -340,10 +329,10 @@ def transfer_words(result: Mapping[str, Any]) -> str:
         )
     stops = sum(row["num_stops"] for row in rows.values())
     words.append(f"The bridge's safety stopped {stops} of {sum(row['num_goals'] for row in rows.values())} goals.")
-    bridge = settings["set_points_per_step"], settings["max_speed_m_s"], settings["max_acceleration_m_s2"]
     words.append(
-        "The bridge of all rows: {} set-points a step, at most {:g} m/s and {:g} m/s2, ".format(*bridge)
-        + f"a grip of at most {settings['grip_force_n']:g} N.{measured_on(result['machine'])}"
+        f"The bridge of all rows: {result['bridge']['set_points_per_step']} set-points a step, at most "
+        f"{safety['max_speed_m_s']:g} m/s and {safety['max_acceleration_m_s2']:g} m/s2, "
+        f"a grip of at most {safety['max_grip_force_n']:g} N.{measured_on(result['machine'])}"
     )
     return " ".join(words)
 
