@@ -19,7 +19,6 @@ champion's primitives, without evaluations and on one thread, for at most 300,00
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -39,15 +38,7 @@ from benchmarks.measuring import (
     ratio,
     run_benchmark,
 )
-from benchmarks.training_process import (
-    ENDLESS,
-    Training,
-    copy_run,
-    environment,
-    measure_training,
-    overrides,
-    scratch,
-)
+from benchmarks.training_process import ENDLESS, Training, environment, measure_copy, overrides, scratch
 from service.base.errors import TandemError
 from service.store.run_directory import RunDirectory
 
@@ -143,11 +134,7 @@ def train(tree: Path, home: Path, num_env_steps: int, config: Path) -> RunDirect
 
 def measure_commit(tree: Path, source: RunDirectory, home: Path, num_iterations: int) -> Sample:
     """Go on from the newest checkpoint of ``source``, in a copy, with the code of a checkout."""
-    copy = copy_run(source, home)
-    with Training(home, overrides(ENDLESS), runtime="local", tree=tree) as training:
-        sample = measure_training(training, num_iterations).sample
-    shutil.rmtree(copy.path)
-    return sample
+    return measure_copy(source, home, overrides(ENDLESS), num_iterations, runtime="local", tree=tree).sample
 
 
 def compare(trees: Mapping[str, Path], home: Path, settings: Settings) -> dict[str, list[Sample]]:

@@ -8,8 +8,8 @@ the CPU time of every process. What ``docs/scaling.md`` says beyond one box was 
 
 from __future__ import annotations
 
+import json
 import os
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,16 +17,7 @@ from typing import Any
 
 from benchmarks.measuring import run_benchmark
 from benchmarks.report.markdown import commit, percent, table
-from benchmarks.training_process import (
-    ENDLESS,
-    PLAIN,
-    Measured,
-    Training,
-    copy_run,
-    measure_training,
-    overrides,
-    scratch,
-)  # fmt: skip
+from benchmarks.training_process import ENDLESS, PLAIN, Measured, measure_copy, overrides, scratch
 from service.config.self_play import SelfPlayConfig
 from service.store.run_directory import RunDirectory
 
@@ -45,14 +36,11 @@ class Settings:
 def measure_run(
     source: RunDirectory, home: Path, num_iterations: int, num_actors: int, actor_threads: int = 1
 ) -> Measured:
-    """Measure a run on Ray, without evaluations and checkpoints, on a copy of ``source`` that is deleted afterwards."""
-    copy = copy_run(source, home)
+    """Measure a run on Ray, without evaluations and checkpoints."""
     arguments = [*overrides(ENDLESS | PLAIN), "--num-actors", str(num_actors), "--actor-threads", str(actor_threads)]
-    num_cores = max(os.cpu_count() or 1, num_actors * actor_threads)
-    with Training(home, arguments, num_cores=num_cores) as training:
-        measured = measure_training(training, num_iterations, num_actors)
-    shutil.rmtree(copy.path)
-    return measured
+    # with fewer cores, further actors would wait for one for ever
+    cores = {"RAY_OVERRIDE_RESOURCES": json.dumps({"CPU": max(os.cpu_count() or 1, num_actors * actor_threads)})}
+    return measure_copy(source, home, arguments, num_iterations, num_actors, variables=cores)
 
 
 def benchmark(settings: Settings) -> dict[str, Any]:

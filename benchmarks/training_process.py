@@ -10,7 +10,6 @@ import os
 import secrets
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -30,6 +29,7 @@ from pydantic import ValidationError
 from benchmarks.measuring import ROOT, Sample
 from benchmarks.processes import cpu_s_by_role
 from service.base.errors import StoreError, TandemError
+from service.base.ports import free_port
 from service.store.checkpoints import CheckpointStore
 from service.store.disk_reader import DiskReader
 from service.store.models import RunStatus
@@ -60,7 +60,6 @@ class Training:
         arguments: of ``tandem pretrain``, besides runtime, run directory and status.
         runtime: which runner; ``ray`` has a status service.
         tree: checkout whose code runs.
-        num_cores: that its Ray believes to have; None: those there are.
         variables: further ones of its environment.
     """
 
@@ -71,26 +70,23 @@ class Training:
         *,
         runtime: Literal["local", "ray"] = "ray",
         tree: Path = ROOT,
-        num_cores: int | None = None,
         variables: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self.directory, self.log_file = RunDirectory(home / "runs" / NAME), home / f"{NAME}.log"
-        self.address = ("127.0.0.1", _free_port())
-        """Host and port of the status service."""
+        address = f"127.0.0.1:{free_port('127.0.0.1')}"
+        self._url = f"http://{address}/v1/runs/{NAME}"
         home.mkdir(parents=True, exist_ok=True)
         command = [sys.executable, "-m", "service", "pretrain", "--run-dir", str(self.directory.path)]
         command += ["--registry", str(home / "registry"), *(["--resume"] if self.directory.exists else [])]
         if runtime == "ray":
-            command += ["--runtime", "ray", "--status", "{}:{}".format(*self.address)]
+            command += ["--runtime", "ray", "--status", address]
         self.records = Records(self.directory.metrics_file)
         self._reader = DiskReader(self.directory.path.parent)
-        # with less, further actors would wait for a core for ever
-        cores = {} if num_cores is None else {"RAY_OVERRIDE_RESOURCES": json.dumps({"CPU": num_cores})}
         with self.log_file.open("ab") as log:
             self._process = subprocess.Popen(
                 [*command, *arguments],
                 cwd=tree,
-                env=environment(home, tree) | cores | dict(variables),
+                env=environment(home, tree) | dict(variables),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -112,19 +108,11 @@ class Training:
         """The exit code; None while it goes on."""
         return self._process.poll()
 
-    def get(self, path: str, timeout_s: float = 5.0) -> bytes:
-        """Answer of the status service; empty if there is none within ``timeout_s``."""
-        try:
-            with _DIRECT.open("http://{}:{}{}".format(*self.address, path), timeout=timeout_s) as response:
-                return bytes(response.read())
-        except (OSError, HTTPException):
-            return b""
-
     def status(self) -> RunStatus | None:
         """The run's status by its status service, else as one for its directory has it; None before there is one."""
         try:
-            if told := self.get(f"/v1/runs/{NAME}", 2.0):
-                return RunStatus.model_validate_json(told)
+            with suppress(OSError, HTTPException), _DIRECT.open(self._url, timeout=2.0) as response:
+                return RunStatus.model_validate_json(response.read())
             return self._reader.run(NAME)
         except (StoreError, ValidationError):
             return None
@@ -225,6 +213,20 @@ def measure_training(
     return Measured(rows[num_before - 1 :], last_s - first_s, role_cpu_s)
 
 
+def measure_copy(
+    source: RunDirectory, home: Path, arguments: Sequence[str], num_iterations: int, num_actors: int = 1, **how: Any
+) -> Measured:
+    """Measure a run in a copy that goes on from its newest checkpoint and is deleted afterwards.
+
+    ``home``, ``arguments`` and ``how`` are those of ``Training``, the numbers those of ``measure_training``.
+    """
+    copy = copy_run(source, home)
+    with Training(home, arguments, **how) as training:
+        measured = measure_training(training, num_iterations, num_actors)
+    shutil.rmtree(copy.path)
+    return measured
+
+
 def environment(home: Path, tree: Path = ROOT) -> dict[str, str]:
     """Variables for a process with a Ray of its own: its files under ``home``, its own token, no other setting."""
     unset = ("RAY_ADDRESS", "TANDEM_REDIS_URL", "TANDEM_TOKEN", "TANDEM_RUNS", "TANDEM_REGISTRY")
@@ -259,9 +261,3 @@ def copy_run(source: RunDirectory, home: Path) -> RunDirectory:
 def overrides(settings: Mapping[str, object]) -> list[str]:
     """``--set`` arguments of the command line."""
     return [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
