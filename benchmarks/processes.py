@@ -12,22 +12,12 @@ _ROLES = (
     ("ray::LearnerActor", "learner"),
     ("ray::GeneratorActor", "generator"),
     ("ray::StatusWorker", "status"),
-    ("ray::IDLE", "idle worker"),
-    ("ray::", "other worker"),
-    ("raylet/raylet", "raylet"),
-    ("gcs/gcs_server", "gcs"),
-    ("redis-server", "redis"),
-    ("runtime_env/agent", "runtime env agent"),
-    ("dashboard/agent", "dashboard agent"),
-    ("dashboard/dashboard", "dashboard"),
-    ("log_monitor", "log monitor"),
-    ("autoscaler", "autoscaler"),
 )
-"""Part of a command line and the role it shows; the first match counts."""
+"""Part of a command line and the role it shows."""
 
 
 def role(command_line: str) -> str:
-    """Role of a process of a run by its command line; ``other`` for what is none of ours."""
+    """Role of a process of a run by its command line; ``other`` for what is none of ours, such as Ray's own."""
     return next((name for part, name in _ROLES if part in command_line), "other")
 
 
