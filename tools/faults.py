@@ -19,7 +19,6 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
-from urllib.parse import urlsplit
 
 from benchmarks.measuring import RECIPE_FILE, run_benchmark
 from benchmarks.processes import descendants
@@ -162,9 +161,7 @@ def redis(watcher: Watcher, kind: signal.Signals) -> tuple[str, bool]:
         if kind == signal.SIGSTOP:
             os.kill(gone.pid, signal.SIGCONT)
         else:
-            gone.close()
-            url = urlsplit(gone.address.url)
-            watcher.redis = RedisServer(gone.directory, port=url.port, password=url.password)
+            gone.revive()
     well = watcher.until(lambda status: status.condition == "well", 60.0)
     ended = changed(before, watcher.workers())
     said = f"the status says redis after {seconds_text(noticed)}; it {'learns on' if learning else 'stands still'}"
@@ -222,20 +219,16 @@ def play(fault: Fault, *, late: bool) -> dict[str, Any]:
         fault: to strike with.
         late: whether it freezes workers, whose rollouts may then come too late.
     """
-    with scratch() as home:
-        server = RedisServer(home / "redis")
+    with scratch() as home, RedisServer(home / "redis") as server:
         with Training(home, ARGUMENTS, variables={"TANDEM_REDIS_URL": server.address.url}) as training:
             watcher = Watcher(training, server)
-            try:
-                training.wait_until("iteration", NUM_CALM_ITERATIONS)
-                said, reached = fault(watcher)
-                account = None
-                if training.ended is None:  # the audit is of a run with one driver from its beginning to its end
-                    watcher.look()
-                    training.stop()
-                    account = audit_run(training.directory, watcher.look(), watcher.seen, late=late)
-            finally:
-                watcher.redis.close()
+            training.wait_until("iteration", NUM_CALM_ITERATIONS)
+            said, reached = fault(watcher)
+            account = None
+            if training.ended is None:  # the audit is of a run with one driver from its beginning to its end
+                watcher.look()
+                training.stop()
+                account = audit_run(training.directory, watcher.look(), watcher.seen, late=late)
         tracebacks = training.log_file.read_text(errors="replace").count("Traceback (most recent call last)")
     whole = account is None or account["complete"]
     return {"seen": said, "reached": reached and whole and not tracebacks, "tracebacks": tracebacks, "account": account}
