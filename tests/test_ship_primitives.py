@@ -14,11 +14,12 @@ from service.policies.numpy_policy import numpy_bob
 from service.registry.loading import load
 from service.registry.publishing import publish
 from service.registry.registry import Registry
+from service.runs.train import publish_learned
 from service.store.run_directory import RunDirectory
 from tests.registry.helpers import assert_identical, files_in
 from tests.runs.runs import TREE, assert_one_line, play, tiny_config
 from tools import ship_primitives
-from tools.ship_primitives import publish_newest, ship
+from tools.ship_primitives import ship
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +106,7 @@ def test_the_newest_bob_of_a_run_is_measured(run, tmp_path, monkeypatch):
     game = {"success_distance_m": 0.05}  # this Bob solves nothing by less
     tree = TREE | {"game": TREE["game"] | game, "run": TREE["run"] | more}
     near.config_file.write_text(dump_config(parse_config(tree, where="a test")))
-    assert str(publish_newest(near, registry)) == "tiny@1"
+    assert str(publish_learned(near.path, registry.root)) == "tiny@1"
     manifest, parameters = registry.load("tiny")
     assert_identical(parameters, load(str(run.path)).parameters)
     env_steps = json.loads(run.metrics_file.read_text().splitlines()[-1])["env_steps"]
@@ -126,15 +127,14 @@ def test_the_newest_bob_of_a_run_is_measured(run, tmp_path, monkeypatch):
     assert 0.0 < manifest.metrics["evaluation/mixed_success_last"] < 1.0  # else any goals would do
 
 
-def test_one_command(run, registry, target, monkeypatch, capsys):
+def test_one_command(registry, target, monkeypatch, capsys):
     def tandem_ships(*arguments):
         monkeypatch.setattr(sys, "argv", ["ship_primitives", *map(str, arguments)])
         return ship_primitives.main()
 
     monkeypatch.setattr(ship_primitives, "BUNDLED", target)
-    assert tandem_ships(run.path) == 0
-    assert f"tiny@1 is in {target}" in capsys.readouterr().out
     assert tandem_ships("tiny@2", "--registry", registry.root) == 0
+    assert f"tiny@1 is in {target}" in capsys.readouterr().out
     assert Registry(target).manifest("tiny@champion").metrics == {"score": 0.5}
     before = files_in(target)
     assert tandem_ships("nobody", "--registry", registry.root) == 2

@@ -1,7 +1,7 @@
 """Put a champion into the package: the primitives that come with ``pip install``.
 
-    python -m tools.ship_primitives runs/cube                           # the newest Bob of a run, measured here
-    python -m tools.ship_primitives panda-cube@7 --registry registry    # a published version
+    tandem publish runs/cube
+    python -m tools.ship_primitives panda-cube@latest --registry registry
 
 ``service/registry`` is a registry like any other, except that only this script writes there. What it ships gets the
 next number and the aliases champion and latest; older versions of its name are removed: the package stays small.
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,22 +22,11 @@ from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.registry.bundled import BUNDLED
-from service.registry.loading import read_stages
 from service.registry.manifest import acting_config
 from service.registry.names import LATEST, Version
-from service.registry.publishing import measure_bob, publish
 from service.registry.registry import Registry
-from service.store.run_directory import RunDirectory
 
 CHAMPION = "champion"
-
-
-def publish_newest(directory: RunDirectory, registry: Registry) -> Version:
-    """Measure and publish the newest Bob of a run, ended or not."""
-    config, stages = directory.read_config(), read_stages(directory)
-    env_steps = max(stages)
-    metrics = measure_bob(config, stages[env_steps]) | {"env_steps": env_steps}
-    return publish(registry, config, stages[env_steps], metrics)
 
 
 def ship(reference: str, source: Registry, target: Path) -> Version:
@@ -89,17 +77,12 @@ def _texts(value: JsonValue) -> Iterator[str]:
 
 @one_line_errors
 def main() -> int:
-    """Parse the command line, publish a run's Bob if need be, ship, verify."""
+    """Parse the command line, ship, verify."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("source", metavar="RUN_DIR|NAME@ALIAS")
-    parser.add_argument("--registry", type=Path, default=Path("registry"), metavar="DIR", help="of NAME@ALIAS")
+    parser.add_argument("reference", metavar="NAME@ALIAS")
+    parser.add_argument("--registry", type=Path, default=Path("registry"), metavar="DIR", help="has it")
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as scratch:
-        reference, source = given.source, Registry(given.registry)
-        if Path(reference).is_dir():
-            source = Registry(Path(scratch))
-            reference = str(publish_newest(RunDirectory(Path(given.source)), source))
-        version = ship(reference, source, BUNDLED)
+    version = ship(given.reference, Registry(given.registry), BUNDLED)
     bundled = Registry(BUNDLED)
     manifest = bundled.manifest(str(version))
     for name, value in manifest.metrics.items():
