@@ -10,10 +10,11 @@ import typer
 from typer.testing import CliRunner
 
 import service
+from service.base.errors import TandemError
 from service.cli.main import app
 from tests.methods.trials import SETS
 from tools import docs_reference
-from tools.docs_site import SiteError, build
+from tools.docs_site import build
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -61,14 +62,14 @@ def test_the_site_builds(tmp_path):
     ],
 )
 def test_a_link_to_nothing_is_refused(tmp_path, no_other_pages, text, said):
-    with pytest.raises(SiteError, match=re.escape(said)):
+    with pytest.raises(TandemError, match=re.escape(said)):
         build(tmp_path / "out", small_site(tmp_path, f"# A\n\n{text}\n"))
 
 
 def test_a_page_has_to_be_in_the_navigation(tmp_path, no_other_pages):
     root = small_site(tmp_path, "# A\n\n`[a](no-link.md)`\n")
     (root / "docs" / "lost.md").write_text("# Lost\n")
-    with pytest.raises(SiteError, match=r"add to nav: lost\.md"):
+    with pytest.raises(TandemError, match=r"add to nav: lost\.md"):
         build(tmp_path / "out", root)
 
 

@@ -24,12 +24,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measuring import machine, one_line_errors, write_json
+from benchmarks.measuring import ROOT, machine, one_line_errors, write_json
 from service.base.errors import TandemError
 from tools.compose_services import read_services, read_variables
 from tools.containers import Containers, need_programs, remove_memory_groups, run
 from tools.deployed_checks import CHECKS, Deployment
-from tools.images import ROOT, Store
+from tools.images import Store
 
 PROGRAMS = ("buildah", "debootstrap", "dnsmasq", "ip", "nsenter", "setpriv", "socat", "tini-static", "unshare")
 SPACES = ("--mount", "--net", "--pid", "--fork", "--kill-child", "--mount-proc")

@@ -16,20 +16,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from benchmarks.measuring import ROOT, one_line_errors
 from service.base.errors import TandemError
 from tools import docs_reference
 
-ROOT = Path(__file__).parents[1]
 OUTSIDE = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "deploy/README.md": "deploy.md"}
 """Pages of the site that do not lie in ``docs/``."""
 NOT_PAGES = {"README.md": "index.md"}
 """What stands for a document that is no page."""
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
 _CODE = re.compile(r"(^ *```.*?^ *```|`[^`\n]+`(?!\]))", re.DOTALL | re.MULTILINE)
-
-
-class SiteError(TandemError):
-    """The site cannot be built."""
 
 
 def build(out: Path, root: Path = ROOT) -> Path:
@@ -48,10 +44,10 @@ def build(out: Path, root: Path = ROOT) -> Path:
     try:
         done = subprocess.run(command, cwd=out, capture_output=True, text=True, timeout=600)
     except subprocess.TimeoutExpired:
-        raise SiteError("zensical did not end within 10 minutes") from None
+        raise TandemError("zensical did not end within 10 minutes") from None
     if done.returncode:
         said = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + done.stderr)
-        raise SiteError(f"zensical --strict failed; it said:\n{said}")
+        raise TandemError(f"zensical --strict failed; it said:\n{said}")
     return out / "site"
 
 
@@ -85,7 +81,7 @@ def _relinked(text: str, source: Path, page: str, known: dict[Path, str], root: 
         if path in known:
             return f"{sign}[{words}]({up}{known[path]}{anchor})"
         if not path.exists() or not path.is_relative_to(root):
-            raise SiteError(f"{source.relative_to(root)}: link to {target}, which is not there")
+            raise TandemError(f"{source.relative_to(root)}: link to {target}, which is not there")
         inside = str(path.relative_to(root))
         if inside in NOT_PAGES:
             return f"[{words}]({up}{NOT_PAGES[inside]})"
@@ -110,9 +106,9 @@ def _with_navigation(settings: str, pages: set[str]) -> str:
     text = re.sub(r'"([^"\n]*\*[^"\n]*\.md)"', spelled, settings)
     named = list(_names(tomllib.loads(text)["project"]["nav"]))
     if missing := sorted(set(named) - pages):
-        raise SiteError(f"docs/zensical.toml: no such page: {', '.join(missing)}")
+        raise TandemError(f"docs/zensical.toml: no such page: {', '.join(missing)}")
     if absent := sorted(pages - set(named)):
-        raise SiteError(f"docs/zensical.toml: add to nav: {', '.join(absent)}")
+        raise TandemError(f"docs/zensical.toml: add to nav: {', '.join(absent)}")
     return text
 
 
@@ -125,15 +121,14 @@ def _names(nav: Any) -> Iterator[str]:
             yield from _names(each)
 
 
-def main() -> None:
+@one_line_errors
+def main() -> int:
     """Entry point of ``python -m tools.docs_site``."""
     parser = argparse.ArgumentParser(description="Build the docs site.")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "docs-site", help="directory; emptied first")
-    try:
-        print(f"{build(parser.parse_args().out.resolve()) / 'index.html'}")
-    except SiteError as error:
-        sys.exit(f"error: {error}")
+    print(f"{build(parser.parse_args().out.resolve()) / 'index.html'}")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

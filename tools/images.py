@@ -16,10 +16,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from benchmarks.measuring import ROOT
 from service.base.errors import TandemError
 from tools.containers import PATH, Image, read_image, run
 
-ROOT = Path(__file__).parents[1]
 DEBIAN = "http://deb.debian.org/debian"
 BASE, TANDEM, OTHERS = "localhost/python:debian", "localhost/tandem:cpu", "localhost/programs:debian"
 PACKAGES = "python3,python3-venv,python-is-python3,ca-certificates"
