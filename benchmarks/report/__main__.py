@@ -10,8 +10,7 @@ something that was not recorded says so. ``results/downstream.md`` is written wh
 from __future__ import annotations
 
 import argparse
-import json
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from benchmarks.measuring import one_line_errors
 from benchmarks.report import comparison, figures, measured, pretraining, recipe, skills
 from benchmarks.report.downstream import draw_table, write_results
 from benchmarks.report.recipe import RECIPE
-from benchmarks.report.results import Result, read_trials
+from benchmarks.report.results import Result, read_all
 from benchmarks.reproduce import experiments
 from benchmarks.run_files import Run
 from service.base.errors import TandemError
@@ -75,12 +74,6 @@ def replace_blocks(path: Path, blocks: Mapping[str, str]) -> str:
     return page
 
 
-def read_all(directory: Path, names: Collection[str] | None = None) -> dict[str, dict[str, Any]]:
-    """Recorded files of a directory by their names, in order; of ``names``, those that are there."""
-    paths = (path for path in sorted(directory.glob("*.json")) if names is None or path.stem in names)
-    return {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in paths}
-
-
 class Report:
     """Draws pictures into ``docs/results``, and writes the pages.
 
@@ -98,8 +91,10 @@ class Report:
         found = read_all(self._results, FILES)
         runs = [run for run in read_all(self._results / "runs").values() if "ablation" not in run]
         studies = read_all(self._results / "time_to_skill")
-        trials, longer = (read_trials(self._results / name) for name in ("downstream", "downstream_longer"))
-        recorded_skills, controls = (list(read_all(self._results / name).values()) for name in ("skills", "controls"))
+        trials, longer, recorded_skills, controls = (
+            list(read_all(self._results / name).values())
+            for name in ("downstream", "downstream_longer", "skills", "controls")
+        )
         for page, names in PAGES.items():  # what is wrong with a page is found before anything is drawn
             words = replace_blocks(self._docs / page, dict.fromkeys(names, ""))
             if page in ABOUT_THE_RECIPE:
@@ -121,7 +116,7 @@ class Report:
             text = replace_blocks(path, {name: "\n\n".join(blocks[name]) for name in PAGES[page]})
             write_atomic(path, text.encode())
             self.files.append(path)
-        self.files += write_results(self._results)
+        self.files += write_results(self._results, trials)
 
     def pretraining_blocks(self, runs: Sequence[Run], found: Results, studies: Results) -> Blocks:
         """Parts of the blocks about pre-training."""

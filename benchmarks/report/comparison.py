@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from benchmarks.report.downstream import BEST, PAPER, Seeds, each_seed
+from benchmarks.report.downstream import BEST, PAPER, Seeds, each_seed, methods_table
 from benchmarks.report.markdown import Row, percent, table
 from benchmarks.report.results import TRIAL, Result, by_method_and_task
 from benchmarks.reproduce import Experiment
@@ -56,14 +56,9 @@ def longer_table(results: Sequence[Result], longer: Sequence[Result]) -> str:
 
 def distances_table(results: Sequence[Result]) -> str:
     """Mean distance between object and goal at the end of the final episodes, of what learns from nothing."""
-    of = by_method_and_task(results)
-    rows: list[Row] = []
-    for name in learning(None):
-        found = [of.get((name, task), []) for task in TASKS]
-        cells = [_mean_distance(trials) if trials else "" for trials in found]
-        rows += [(METHODS[name].title, *cells)] if any(cells) else []
+    of = {place: seeds for place, seeds in by_method_and_task(results).items() if place[0] in learning(None)}
     words = "Distance of the object from the goal at the end of the final episodes, mean of episodes and seeds:"
-    return f"{words}\n\n{table(('', *(task.title for task in TASKS.values())), rows)}" if rows else ""
+    return f"{words}\n\n{methods_table(of, _mean_distance).rstrip()}" if of else ""
 
 
 def harder_table(results: Sequence[Result]) -> str:

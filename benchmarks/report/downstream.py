@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from benchmarks.report.markdown import Row, table
-from benchmarks.report.results import TRIAL, Result, by_method_and_task, read_trials
+from benchmarks.report.results import TRIAL, Result, by_method_and_task
+from benchmarks.run_files import steps_until
 from service.base.errors import TandemError
 from service.base.files import write_atomic
 from service.envs.tasks import HARD_TASKS, TASKS, find_task
@@ -52,21 +52,15 @@ BEST: Mapping[str, float] = {task: max(rates[task] for rates in PAPER.values()) 
 """The best of all the paper's methods, skill discovery included."""
 
 
-def write_results(out: Path) -> list[Path]:
-    """Write page and picture from every result in the directory."""
-    found, page = read_trials(out / "downstream"), out / PAGE_FILE
-    picture = draw_table(found, out / PICTURE_FILE)
-    write_atomic(page, write_page(found, PICTURE_FILE).encode())
+def write_results(out: Path, trials: Sequence[Result]) -> list[Path]:
+    """Write page and picture."""
+    page, picture = out / PAGE_FILE, draw_table(trials, out / PICTURE_FILE)
+    write_atomic(page, write_page(trials).encode())
     return [page, picture]
 
 
-def write_page(results: Sequence[Result], picture: str) -> str:
-    """Write the whole page.
-
-    Args:
-        results: of trials.
-        picture: file name of the learning curves, beside the page.
-    """
+def write_page(results: Sequence[Result]) -> str:
+    """The whole page."""
     check_versions(results)
     of = by_method_and_task(results)
     parts = [
@@ -79,19 +73,19 @@ def write_page(results: Sequence[Result], picture: str) -> str:
         "they are of another world, likely a harder one "
         "([cell by cell](comparison.md), and what differs). Tasks and methods may have had different numbers of env "
         "steps: they are below.\n",
-        _table(of, _rate("success_last"), paper=True),
+        methods_table(of, _rate("success_last"), paper=True),
         "\n## Success at any step\n",
-        _table(of, _rate("success_ever")),
+        methods_table(of, _rate("success_ever")),
         "\n## Each seed, at the last step\n",
-        _table(of, each_seed),
+        methods_table(of, each_seed),
         "\n## Learning curves\n",
-        f"![Success at the last step over env steps; bands from the least to the greatest seed]({picture})\n",
+        f"![Success at the last step over env steps; bands from the least to the greatest seed]({PICTURE_FILE})\n",
         "Without noise, 100 goals a point; dotted: what learns nothing. Where a curve still rises, the tables say what "
         "the method has after so many env steps, not what it would come to.\n",
         "## Env steps and time\n",
         "Learning alone, without evaluations: env steps in thousands, minutes of wall-clock time. Before the plus sign "
         "what the primitives or skills took, in millions of env steps: all tasks have the same.\n",
-        _table(of, _cost),
+        methods_table(of, _cost),
         *_efficiency(of),
         *_harder(of),
         "\n" + _origin(results),
@@ -107,11 +101,11 @@ def _harder(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
         "The end effector starts 20 cm above the table instead of 8, and the cube has 1 kg instead of 0.1 and half the "
         "grip ([decision 7](../decisions/0007-the-downstream-tasks.md)). At the last step, each seed, and at any "
         "step:\n",
-        _table(of, _rate("success_last"), tasks=tasks),
-        _table(of, each_seed, tasks=tasks),
-        _table(of, _rate("success_ever"), tasks=tasks),
+        methods_table(of, _rate("success_last"), tasks=tasks),
+        methods_table(of, each_seed, tasks=tasks),
+        methods_table(of, _rate("success_ever"), tasks=tasks),
         "Env steps and time:\n",
-        _table(of, _cost, tasks=tasks),
+        methods_table(of, _cost, tasks=tasks),
     )
 
 
@@ -124,7 +118,7 @@ def check_versions(results: Sequence[Result]) -> None:
             )
 
 
-def _table(
+def methods_table(
     of: Mapping[tuple[str, str], Seeds],
     text: Callable[[Seeds], str],
     *,
@@ -199,20 +193,8 @@ def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
 
 def _mean_until(seeds: Seeds, level: float) -> float | None:
     """Env steps until a level, mean of the seeds; None: not every seed reaches it."""
-    soon = [steps_until(result["curve"], level) for result in seeds]
-    return None if not soon or None in soon else float(np.mean(soon))  # type: ignore[arg-type]
-
-
-def steps_until(curve: Sequence[dict[str, float]], level: float) -> float | None:
-    """Env steps of the second of the first two evaluations in a row that are at ``level`` on average; None: never.
-
-    Two, since one of 100 goals is noisy, and first passages pick the luckiest; the second, since before it nothing was
-    known.
-    """
-    for first, second in pairwise(curve):
-        if (first["success_last"] + second["success_last"]) / 2 >= level > 0.0:
-            return second["env_steps"]
-    return None
+    soon = [steps_until(result["curve"], "success_last", level, num_in_a_row=2) for result in seeds]
+    return None if not soon or None in soon or not level else float(np.mean(soon))  # type: ignore[arg-type]
 
 
 def _soonest(of: Mapping[str, Seeds], level: float) -> str:

@@ -1,9 +1,9 @@
-"""Recorded trainings of tasks, one JSON file each, which ``benchmarks/trials.py`` writes: read, and put in order."""
+"""Recorded files, of which those of ``benchmarks/trials.py`` are put in order."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,10 @@ FORMAT_VERSION = 1
 Result = dict[str, Any]
 
 
-def read_trials(directory: Path) -> list[Result]:
-    """Every result of a directory, by task, method and seed."""
-    return [json.loads(path.read_text(encoding="utf-8")) for path in sorted(directory.glob("*.json"))]
+def read_all(directory: Path, names: Collection[str] | None = None) -> dict[str, Result]:
+    """Recorded files of a directory by their names, in order; of ``names``, those that are there."""
+    paths = (path for path in sorted(directory.glob("*.json")) if names is None or path.stem in names)
+    return {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in paths}
 
 
 def by_method_and_task(results: Sequence[Result]) -> dict[tuple[str, str], list[Result]]:

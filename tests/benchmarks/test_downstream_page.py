@@ -3,7 +3,7 @@
 import pytest
 from PIL import Image
 
-from benchmarks.report.downstream import check_versions, draw_table, steps_until
+from benchmarks.report.downstream import _mean_until, check_versions, draw_table
 from service.base.errors import TandemError
 
 
@@ -41,7 +41,7 @@ def test_results_of_another_version_of_a_task_are_refused():
 
 def test_how_soon_by_hand():
     curve = [{"env_steps": step, "success_last": rate} for step, rate in [(1, 0.9), (2, 0.1), (3, 0.8), (4, 0.9)]]
-    assert steps_until(curve, 0.5) == 2  # of the two that are good enough on average, the last
-    assert steps_until(curve, 0.6) == 4
-    assert steps_until(curve, 0.9) is None
-    assert steps_until(curve, 0.0) is None
+    assert _mean_until([{"curve": curve}], 0.5) == 2  # of the two that are good enough on average, the last
+    assert _mean_until([{"curve": curve}], 0.6) == 4
+    assert _mean_until([{"curve": curve}], 0.9) is None
+    assert _mean_until([{"curve": curve}], 0.0) is None

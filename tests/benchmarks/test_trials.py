@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import trials
-from benchmarks.report.results import by_method_and_task, read_trials
+from benchmarks.report.results import by_method_and_task, read_all
 from benchmarks.trials import run_trial, trial_config
 from service.base.errors import TandemError
 
@@ -59,7 +59,7 @@ def test_what_learns_nothing_plays_and_is_recorded(tmp_path, monkeypatch, capsys
     command += ["--set", "run.final_episodes=40", "--set", "run.num_threads=1", "--out", str(out)]
     monkeypatch.setattr("sys.argv", command)
     assert trials.main() == 0
-    (result,) = read_trials(tmp_path)
+    (result,) = read_all(tmp_path).values()
     assert keys(result) == keys(recorded("wall-asp-only-0"))
     assert (result["env_steps"], result["curve"], result["evaluation"]["num_episodes"]) == (0, [], 40)
     assert trials.main() == 0
