@@ -69,18 +69,13 @@ def box(measured: Measured, num_actors: int, num_worlds: int) -> dict[str, Any]:
     rollouts = [row.get("actor/num_rollouts", 1.0) for row in rows]
     played_s = sum(row.get("time/play_s", 0.0) * num for row, num in zip(rows, rollouts, strict=True))
     learned_s = sum(row.get("time/learn_s", 0.0) for row in rows)
-    roles = sorted(measured.role_cpu_s.items())
     return {
         "env_steps_per_s": measured.sample.steps_per_s,
         "iteration_s": wall_s / len(rows),
-        "rollouts_per_iteration": sum(rollouts) / len(rows),
         "num_worlds": num_worlds,
-        "play_s": played_s / sum(rollouts),
-        "learn_s": learned_s / len(rows),
         "learner_idle_share": 1.0 - learned_s / wall_s,
         "actor_idle_share": 1.0 - played_s / (num_actors * wall_s),
-        "cores": {role: seconds / wall_s for role, seconds in roles},
-        "cpu_s_per_iteration": {role: seconds / len(rows) for role, seconds in roles},
+        "cores": {role: seconds / wall_s for role, seconds in sorted(measured.role_cpu_s.items())},
     }
 
 

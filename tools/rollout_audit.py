@@ -44,11 +44,6 @@ class Stretch:
         )
 
 
-def ledger_of(rows: Sequence[Sequence[int]]) -> dict[tuple[int, int], int]:
-    """The ledger from its rows in a checkpoint: actor, incarnation, highest sequence."""
-    return {(int(actor), int(incarnation)): int(highest) for actor, incarnation, highest in rows}
-
-
 def stretches_of(statuses: Sequence[RunStatus]) -> list[Stretch]:
     """Stretches of every rollout actor, from a run's statuses in order."""
     told: dict[str, list[tuple[int, int]]] = {}
@@ -120,5 +115,6 @@ def audit_run(
 ) -> dict[str, Any]:
     """Audit a run that has ended, see ``audit_rollouts``, from its directory and the statuses seen on its way."""
     newest = CheckpointStore(directory.checkpoints, keep=1).load_latest()
-    ledger = ledger_of(newest.arrays["learner/counted"].tolist())
+    rows = newest.arrays["learner/counted"].tolist()
+    ledger = {(int(actor), int(incarnation)): int(highest) for actor, incarnation, highest in rows}
     return audit_rollouts(read_jsonl(directory.metrics_file), ledger, end, stretches_of([*seen, end]), late=late)
