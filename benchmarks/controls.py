@@ -17,13 +17,10 @@ from typing import Any
 from benchmarks.measuring import RECIPE_FILE, ROOT, one_line_errors, write_json
 from benchmarks.record_run import head_of, measure_tasks
 from benchmarks.run_files import COUNTERS, Run, thin
-from benchmarks.trials import NUM_EPISODES, run_trial, trial_config
-from service.base.errors import TandemError
+from benchmarks.trials import NUM_EPISODES, learn, run_trial, trial_config
 from service.config import Config, load_config
 from service.media.figures import read_records
 from service.registry.loading import load
-from service.runs.resuming import resumed_config
-from service.runs.train import train
 from service.store.run_directory import RunDirectory
 
 OURS = "ours"
@@ -85,27 +82,16 @@ def bob_env_steps(records: list[dict[str, Any]]) -> int:
 
 def run_control(config: Config, name: str, runs: Path, trial_steps: int = TRIAL_STEPS) -> Run:
     """Run, or go on with, what a control consists of, in directories below ``runs``."""
-    directory = RunDirectory(runs / f"{name}-{config.seed}")
-    resume = directory.exists
-    if resume and resumed_config(directory, []) != config:
-        raise TandemError(f"{directory.path} holds a run of another configuration; remove it")
-    done = train(config, directory, directory.path, resume=resume, publish=False, on_iteration=_show)
-    if done.reason == "interrupted":  # what it learned so far is no result
-        raise TandemError(f"stopped at {done.num_env_steps:,} env steps; the same command goes on from there")
+    path = runs / f"{name}-{config.seed}"
+    directory, _ = learn(config, path, path)
     found = {}
     for task in TASKS:
         settings = [f"run.total_env_steps={trial_steps}", f"run.final_episodes={NUM_EPISODES}"]
         settings.append(f"run.num_threads={config.run.num_threads}")
-        trial = trial_config(task, METHOD, config.seed, str(directory.path.absolute()), settings)
-        found[task] = run_trial(trial, directory.path, runs / f"{name}-{config.seed}-{task}")
+        trial = trial_config(task, METHOD, config.seed, str(path.absolute()), settings)
+        found[task] = run_trial(trial, path, runs / f"{name}-{config.seed}-{task}")
         print(f"  {task}: {found[task]['evaluation']['success_last']:.1%}", flush=True)
     return record_control(directory, name, found)
-
-
-def _show(metrics: dict[str, float]) -> None:
-    if "evaluation/mixed_success_last" in metrics:
-        rates = ", ".join(f"{kind} {metrics[f'evaluation/{kind}_success_last']:.0%}" for kind in ("mixed", "table"))
-        print(f"  {metrics['env_steps']:>12,.0f} env steps, {metrics['time/wall_s']:.0f} s: {rates}", flush=True)
 
 
 @one_line_errors

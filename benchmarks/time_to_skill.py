@@ -46,21 +46,19 @@ def run_seed(config: Path, settings: Sequence[str], seed: int, max_env_steps: in
         start_s = time.monotonic()
         arguments = ["--config", str(config), "--no-publish", *given, *budget]
         with Training(home, arguments, runtime="local") as training:
-            found = None
-            while found is None and (not points or points[-1]["env_steps"] < max_env_steps):
+            found, rows = None, list[dict[str, float]]()
+            while found is None and (not rows or rows[-1]["env_steps"] < max_env_steps):
                 rows = training.wait_for(training.records.new, 600.0)
                 seen_s, cpu_s = time.monotonic() - start_s, sum(cpu_s_by_role(training.pid).values())
                 times = {"wall_s": seen_s, "cpu_s": cpu_s}
-                points += [_point(row) | times for row in rows if SUCCESS in row]
+                points += [
+                    {"success": row[SUCCESS], "env_steps": row["env_steps"], "iteration": row["iteration"]} | times
+                    for row in rows
+                    if SUCCESS in row
+                ]
                 found = first_in_a_row([each["success"] for each in points])
-                if rows[-1]["env_steps"] >= max_env_steps:
-                    break
     there = points[found] if found is not None else None
     return {"seed": seed, "reached": there is not None, "max_env_steps": max_env_steps, "at": there, "curve": points}
-
-
-def _point(row: Mapping[str, float]) -> dict[str, float]:
-    return {"success": row[SUCCESS], "env_steps": row["env_steps"], "iteration": row["iteration"]}
 
 
 def report(result: Mapping[str, Any]) -> str:

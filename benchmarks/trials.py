@@ -20,6 +20,7 @@ from service.actors.evaluation import DeterministicPolicy, IdlePolicy
 from service.base.errors import TandemError
 from service.base.jsonl import read_jsonl
 from service.base.version import git_commit
+from service.config import Config
 from service.config.load import parse_config
 from service.config.task import TaskConfig
 from service.config.tree import apply_override
@@ -52,14 +53,20 @@ def run_trial(config: TaskConfig, registry: Path, path: Path) -> Result:
     begun = config.begin(registry, None)
     if not find_method(config.method).learns:
         return _recorded(begun, registry, _play(begun, registry), [])
+    directory, result = learn(begun, registry, path)
+    return _recorded(begun, registry, result, read_jsonl(directory.metrics_file))
+
+
+def learn(config: Config, registry: Path, path: Path) -> tuple[RunDirectory, dict[str, Any]]:
+    """Train in a run directory, or go on there until it has its result; both."""
     directory = RunDirectory(path)
-    if directory.exists and directory.read_config() != begun:
+    if directory.exists and directory.read_config() != config:
         raise TandemError(f"{path} holds a run of another configuration; remove it, or name another directory")
     if (result := directory.read_result() if directory.exists else None) is None:
-        train(begun, directory, registry, resume=directory.exists, publish=False, on_iteration=lambda _: None)
+        train(config, directory, registry, resume=directory.exists, publish=False, on_iteration=lambda _: None)
         if (result := directory.read_result()) is None:
             raise TandemError(f"{path}: stopped before its end; the same command goes on from there")
-    return _recorded(begun, registry, result, read_jsonl(directory.metrics_file))
+    return directory, result
 
 
 def _play(config: TaskConfig, registry: Path) -> dict[str, Any]:
