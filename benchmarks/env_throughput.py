@@ -5,8 +5,7 @@
 Both sides do the same: episodes of 50 random actions with their resets, 20 physics steps of 2 ms an action, the
 observation and the test for success of every step. Random arms rarely meet the object, and contact is dear, so each
 side also plays episodes that reach for the object and squeeze it. panda-gym steps one world with one thread, so ours
-gets one thread, too. What our batch gains over our own Gymnasium environment is one call for all worlds. The last row
-is the physics of pre-training, half as many steps of 4 ms; panda-gym is not compared with it.
+gets one thread, too. What our batch gains over our own Gymnasium environment is one call for all worlds.
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ EPISODE_STEPS = 50
 PICK_AND_PLACE, PUSH = PANDA_GYM_IDS = ("PandaPickAndPlace-v3", "PandaPush-v3")
 BATCH = "tandem"
 ONE_WORLD = "tandem, one world, Gymnasium"
-PRETRAINING = "tandem, 10 x 4 ms"
 GRASPING = ", grasping"
 """Ends the name of a row that reaches for the object and squeezes it."""
 COMPARED = (
@@ -124,12 +122,10 @@ def contenders(num_worlds: int) -> dict[str, BatchContender | GymnasiumContender
     """Every row of the table by its name, ours first."""
     rows: dict[str, BatchContender | GymnasiumContender] = {BATCH: BatchContender(WorldConfig(), num_worlds)}
     rows |= {name: panda_gym(name) for name in PANDA_GYM_IDS}
-    coarse = WorldConfig(physics_step_s=0.004, num_substeps=10)
     return rows | {
         BATCH + GRASPING: BatchContender(WorldConfig(), num_worlds, grasping=True),
         PICK_AND_PLACE + GRASPING: panda_gym(PICK_AND_PLACE, grasping=True),
         ONE_WORLD: GymnasiumContender(TABLETOP_ID),
-        PRETRAINING: BatchContender(coarse, num_worlds),
     }
 
 
