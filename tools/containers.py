@@ -18,7 +18,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
 
 from service.base.errors import TandemError
 from tools.compose_services import Service
@@ -118,7 +117,8 @@ class Container:
         script.write_text("\n".join(self._script()) + "\n")
         script.chmod(0o600)  # it has the secrets
         spaces = ["unshare", "--mount", "--pid", "--ipc", "--uts", "--fork", "--kill-child"]
-        with self._open_log() as log:
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        with self.log.open("ab") as log:
             self._process = subprocess.Popen(
                 ["nsenter", f"--net=/run/netns/{self.name}", *spaces, "/bin/sh", "-eu", str(script)],
                 stdin=subprocess.DEVNULL,
@@ -265,10 +265,6 @@ class Container:
             *("env", "-i", "-C", self._image.directory, *(f"{key}={value}" for key, value in variables.items())),
             *("setpriv", f"--reuid={user}", f"--regid={group}", "--clear-groups", *rights),
         ]
-
-    def _open_log(self) -> IO[bytes]:
-        self.log.parent.mkdir(parents=True, exist_ok=True)
-        return self.log.open("ab")
 
 
 class Containers:

@@ -80,7 +80,8 @@ def check(store: Store, home: Path, file: Path | None) -> int:
     deployment = Deployment(home, services, variables, Containers(home, store.images()))
     results = [_make(name, each, deployment) for name, each in CHECKS.items()]
     deployment.down()
-    if any(each["outcome"] == "failed" for each in results):
+    failed = any(each["outcome"] == "failed" for each in results)
+    if failed:
         kept = store.directory / "last-failure"
         shutil.rmtree(kept, ignore_errors=True)
         shutil.copytree(home / "logs", kept)
@@ -88,7 +89,7 @@ def check(store: Store, home: Path, file: Path | None) -> int:
     if file is not None:
         result = {"tool": "deployed", "recorded": machine(), "image": store.describe(), "checks": results}
         write_json(file, result)
-    return int(any(each["outcome"] == "failed" for each in results))
+    return int(failed)
 
 
 def _make(name: str, function: Callable[[Deployment], Any], deployment: Deployment) -> dict[str, Any]:

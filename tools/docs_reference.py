@@ -18,7 +18,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 import service
-from benchmarks.report.markdown import table
+from benchmarks.report.markdown import cell, table
 from service.cli.main import app
 from service.config import Config, load_config
 from service.config.find import METHODS, find_class
@@ -26,6 +26,7 @@ from service.config.recipes import DEFAULT_RECIPE, recipes
 from service.config.self_play import SelfPlayConfig
 
 SECTIONS = ("Args", "Returns", "Raises", "Yields", "Attributes")
+SIGNS = {annotated_types.Ge: ">=", annotated_types.Gt: ">", annotated_types.Le: "<=", annotated_types.Lt: "<"}
 RETURNED = (
     ("service.registry.loading", "Trained"),
     ("service.policies.numpy_policy", "NumpyMCPPolicy"),
@@ -138,8 +139,6 @@ def _default(field: FieldInfo) -> str:
     if field.is_required():
         return "*required*"
     value = field.get_default(call_default_factory=True)
-    if isinstance(value, BaseModel):
-        return "see below"
     return "" if value is PydanticUndefined else _shown(value)
 
 
@@ -159,11 +158,9 @@ def _range(field: FieldInfo) -> str:
     choices = [repr(each) for each in _literals(field.annotation)]
     bounds = []
     for limit in field.metadata:
-        for kind, sign in ((annotated_types.Ge, ">="), (annotated_types.Gt, ">"), (annotated_types.Le, "<=")):
+        for kind, sign in SIGNS.items():
             if isinstance(limit, kind):
                 bounds.append(f"{sign} {getattr(limit, kind.__name__.lower())}")
-        if isinstance(limit, annotated_types.Lt):
-            bounds.append(f"< {limit.lt}")
     return ", ".join(f"`{each}`" for each in [*(each.replace("'", "") for each in choices), *bounds])
 
 
@@ -254,8 +251,3 @@ def prose(text: str) -> str:
     """Text of a docstring or an option as one line of Markdown."""
     text = re.sub(r":class:`~?([^`]*)`", r"`\1`", text).replace("``", "`")
     return cell(re.sub(r"(?<!`)<(\w+)>", r"`<\1>`", " ".join(text.split())))
-
-
-def cell(text: str) -> str:
-    """What may stand in a table."""
-    return text.replace("|", r"\|")

@@ -238,7 +238,9 @@ def draw_table(results: Sequence[Result], path: Path) -> Path:
         for method, described in METHODS.items():
             if (method, name) in of:
                 lines[described.title] = _draw_method(axes, of[method, name], *styles[method])
-        _finish(axes, find_task(name).title)
+        style_axes(axes)
+        axes.set_title(find_task(name).title, loc="left", fontsize=11)
+        axes.set_xlabel("env steps, thousands", color=FAINT, fontsize=9)
         axes.set_ylim(-0.02, 1.02)
         axes.set_xlim(0.0, 1.02 * longest or 1.0)
     titles = [described.title for described in METHODS.values() if described.title in lines]
@@ -282,9 +284,3 @@ def _draw_method(axes: Axes, results: Seeds, colour: str, style: str) -> Line2D:
     if len(curves) > 1:
         axes.fill_between(steps, values.min(0), values.max(0), color=colour, alpha=0.18, linewidth=0)
     return line
-
-
-def _finish(axes: Axes, title: str) -> None:
-    style_axes(axes)
-    axes.set_title(title, loc="left", fontsize=11)
-    axes.set_xlabel("env steps, thousands", color=FAINT, fontsize=9)

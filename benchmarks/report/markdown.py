@@ -15,6 +15,11 @@ def table(head: Row, rows: Iterable[Row]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in (head, ("---",) * len(head), *rows))
 
 
+def cell(text: str) -> str:
+    """Text as it may stand in a table."""
+    return text.replace("|", r"\|").replace("\n", " ")
+
+
 def percent(share: float, digits: int = 0) -> str:
     """A share for a cell or a sentence; nothing for not-a-number."""
     return f"{100 * share:.{digits}f} %" if np.isfinite(share) else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from benchmarks.report.markdown import measured_on, percent, table
+from benchmarks.report.markdown import cell, measured_on, percent, table
 
 Result = Mapping[str, Any]
 SURVIVED = "survived"
@@ -56,7 +56,7 @@ def checks_table(result: Result) -> str:
     rows = [
         (
             each["what"],
-            _cell(each["seen"]),
+            cell(each["seen"]),
             f"{each['seconds']:.0f} s",
             "" if each["outcome"] == "passed" else "**failed**",
         )
@@ -113,10 +113,6 @@ def speed_words(result: Result) -> str:
     )
 
 
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("\n", " ")
-
-
 def _self_play(run: Result) -> str:
     shares = {key: f"{100 * run[key]:.0f} %" for key in ("valid_fraction", "lifted_fraction", "success_rate")}
     return (
@@ -144,7 +140,7 @@ def mutation_table(result: Result) -> str:
     rows = [
         (
             f"{_file(each)}:{each['line']}",
-            " ".join(f"`{_cell(line)}`" for line in _changed(each)),
+            " ".join(f"`{cell(line)}`" for line in _changed(each)),
             _reason(each) or "**no test**",
         )
         for each in result["mutants"]
