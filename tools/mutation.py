@@ -74,15 +74,15 @@ def draw_mutants(files: Sequence[Path], num: int, seed: int) -> Iterator[Mutant]
 
 
 def judge(mutant: Mutant, copy: Path, python: Path) -> str:
-    """The tests that noticed, as "killed by ..."; else "survived"."""
+    """The test that noticed, as "killed by ..."; else "survived"."""
     target = copy / mutant.file
     original = target.read_text(encoding="utf-8")
     target.write_text(mutant.code, encoding="utf-8")
     try:
         own = f"tests/{Path(mutant.file).parts[1]}"
         for tests in (own, "-m", "not slow"), ("tests", "-m", "not slow"), (own, "-m", "slow"):
-            if not _pass(tests, copy, python):
-                return f"killed by {' '.join(tests)}"
+            if failure := _failure(tests, copy, python):
+                return f"killed by {failure}"
         return "survived"
     finally:
         target.write_text(original, encoding="utf-8")
@@ -137,14 +137,20 @@ def _left_out(directory: str, names: list[str]) -> list[str]:
     return [name for name in names if directory == str(ROOT) and name in (".venv", ".git", "runs", "registry")]
 
 
-def _pass(tests: Sequence[str], copy: Path, python: Path) -> bool:
+def _failure(tests: Sequence[str], copy: Path, python: Path) -> str:
+    """What failed first, in a line; nothing if all pass."""
     environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1", "HOME": str(Path.home())}
     command = [str(python), "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", *tests]
     try:
-        done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, timeout=TIMEOUT_S, check=False)
+        done = subprocess.run(
+            command, cwd=copy, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
+        )
     except subprocess.TimeoutExpired:
-        return False
-    return done.returncode in (0, pytest.ExitCode.NO_TESTS_COLLECTED)
+        return f"{' '.join(tests)}, which took {TIMEOUT_S:.0f} s"
+    if done.returncode in (0, pytest.ExitCode.NO_TESTS_COLLECTED):
+        return ""
+    failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    return failed[0][:300] if failed else f"{' '.join(tests)}, exit status {done.returncode}"
 
 
 def run(num: int, seed: int, python: Path, parallel: int) -> list[dict[str, Any]]:
@@ -155,9 +161,12 @@ def run(num: int, seed: int, python: Path, parallel: int) -> list[dict[str, Any]
         for number in range(parallel):
             copies.put(copy := Path(place) / str(number))
             shutil.copytree(ROOT, copy, ignore=_left_out)
-        for tests in (("tests", "-m", "not slow"), *((f"tests/{package}", "-m", "slow") for package in PACKAGES)):
-            if not _pass(tests, copy, python):  # else every mutant would seem to be killed
-                raise SystemExit(f"{' '.join(tests)} fails without any change: mend that first")
+
+        def unchanged(tests: Sequence[str]) -> None:
+            copy = copies.get()
+            if failure := _failure(tests, copy, python):  # else every mutant would seem to be killed
+                raise SystemExit(f"{failure} fails without any change: mend that first")
+            copies.put(copy)
 
         def one(mutant: Mutant) -> dict[str, Any]:
             copy = copies.get()
@@ -170,6 +179,8 @@ def run(num: int, seed: int, python: Path, parallel: int) -> list[dict[str, Any]
             kept = {key: value for key, value in asdict(mutant).items() if key != "code"}
             return {**kept, "diff": diff, "outcome": outcome}
 
+        rooms = [(f"tests/{package}", "-m", "slow") for package in PACKAGES]
+        list(executor.map(unchanged, [("tests", "-m", "not slow"), *rooms]))
         return list(executor.map(one, draw_mutants(files, num, seed)))
 
 
