@@ -12,12 +12,13 @@ _ROLES = (
     ("ray::LearnerActor", "learner"),
     ("ray::GeneratorActor", "generator"),
     ("ray::StatusWorker", "status"),
+    ("raylet/raylet", "raylet"),
 )
 """Part of a command line and the role it shows."""
 
 
 def role(command_line: str) -> str:
-    """Role of a process of a run by its command line; ``other`` for what is none of ours, such as Ray's own."""
+    """Role of a process of a run by its command line; ``other`` for what is none of these."""
     return next((name for part, name in _ROLES if part in command_line), "other")
 
 
