@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from service.actors.evaluation import Evaluation, IdlePolicy, evaluate, wilson_interval
+from service.base.liveness import work_done
 from service.config import WorldConfig
 from service.envs.sampling import GOAL_KINDS, sample_goals, sample_on_table
 
@@ -207,6 +208,13 @@ def test_a_seed_determines_goals_and_starts():
     one, same, other = (run(IdlePolicy(), num_episodes=20, seed=seed) for seed in (3, 3, 4))
     assert one == same
     assert one.mean_distance_m != other.mean_distance_m
+
+
+def test_every_step_counts_as_work():
+    """So a worker that evaluates is not taken for one that hangs, however long it takes."""
+    before = work_done()
+    run(IdlePolicy(), num_steps=7)
+    assert work_done() - before == 7
 
 
 def test_as_dict_is_json():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from service.actors.self_play import SelfPlay
+from service.base.liveness import work_done
 from service.envs.batch import WorldBatch
 from service.generator.opponents import RoundPlan
 from service.generator.validity import Verdict
@@ -453,6 +454,14 @@ def test_env_steps_are_those_simulated(rollout):
     bobs = int(rollout.records.num_bob_steps.sum())
     assert rollout.num_env_steps == 5 * 9 + bobs
     assert rollout.metrics["bob/env_steps_fraction"] == bobs / (5 * 9 + bobs)
+
+
+def test_every_step_of_both_turns_counts_as_work():
+    game, before = make_game(make_config(1), [IN_FRONT]), work_done()
+    turns = play(game, Pusher())
+    bobs = int(turns.bob.active.sum())
+    assert bobs > 0
+    assert work_done() - before == 9 + bobs
 
 
 def test_contact_fractions():

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import nn
 
+from service.base.liveness import work_done
 from service.config.self_play import ABCConfig, PPOConfig
 from service.learner import ppo
 from service.learner.player import Player
@@ -218,8 +219,9 @@ def test_a_collapse_is_undone():
 
 def test_the_policy_stops_early_and_the_value_network_goes_on():
     player = make_player(learning_rate=0.05, num_epochs=10, target_kl=0.01)
-    samples = play(player, np.random.default_rng(0), num=320)
+    samples, before = play(player, np.random.default_rng(0), num=320), work_done()
     stats = train(player, samples, None, ABC, np.random.default_rng(0))
+    assert work_done() - before == 100  # the learner is seen to go on
     assert stats.stopped
     assert 1 <= len(stats.scalars["policy_loss"]) < 50
     assert len(stats.scalars["value_loss"]) == 100
