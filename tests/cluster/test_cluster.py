@@ -300,7 +300,8 @@ def lost_object():
 
 def test_what_is_lost_or_cannot_be_mended(monkeypatch):
     """Each time the method says so in a line and could go on, were it not for that."""
-    method = RaySelfPlay(tiny_config(), ClusterOptions(num_actors=1))
+    raylet = SimpleNamespace(silent=False)
+    method = RaySelfPlay(tiny_config(), ClusterOptions(num_actors=1), raylet=raylet)
 
     def learn(num):
         until = method.iteration + num
@@ -331,6 +332,12 @@ def test_what_is_lost_or_cannot_be_mended(monkeypatch):
     try:
         method.start()
         learn(2)
+        raylet.silent = True  # then nobody is called hung, however short the bound
+        with monkeypatch.context() as patch:
+            patch.setattr(watch, "STALL_S", 0.0)
+            learn(2)
+        learn(3)  # each worker has ended a call since then: the usual bound holds
+        raylet.silent = False
         # The driver's node has copies of what the next workers begin with.
         while None in method._copies.values():
             method.step()

@@ -1,12 +1,13 @@
 """Which workers hang: those that count no further while the driver looks, however slow the others are."""
 
+from threading import Event
 from types import SimpleNamespace
 
 import pytest
 from ray.exceptions import RayError
 
 from service.cluster import watch
-from service.cluster.watch import FIRST_S, LOOK_S, STALL_S, Clock, Watch
+from service.cluster.watch import FIRST_S, LOOK_S, STALL_S, Clock, RayletWatch, Watch
 
 
 class Worker:
@@ -133,3 +134,39 @@ def test_a_process_that_is_gone_is_left_to_its_call(worker, monkeypatch):
     worker.watch.begin()
     monkeypatch.setattr(watch.ray, "get", fail)
     assert worker.looks(10.0) is None
+
+
+class Raylet:
+    """It answers so often, and then never again; each look at it takes half a second of its clock."""
+
+    def __init__(self, monkeypatch, num_answers):
+        self.now, self.num_answers, self.last_s = 0.0, num_answers, 0.0
+        context = SimpleNamespace(get_node_id=lambda: "here")
+        here = {"NodeID": "here", "NodeManagerAddress": "127.0.0.1", "NodeManagerPort": 1}
+        monkeypatch.setattr(watch, "time", SimpleNamespace(monotonic=lambda: self.now))
+        monkeypatch.setattr(watch, "ray", SimpleNamespace(get_runtime_context=lambda: context, nodes=lambda: [here]))
+        monkeypatch.setattr(watch, "init_grpc_channel", lambda address: self)
+        monkeypatch.setattr(watch, "ASK_S", 0.0)
+
+    def unary_unary(self, method):
+        return SimpleNamespace(future=lambda request: SimpleNamespace(done=self.done, exception=lambda: None))
+
+    def done(self):
+        self.now += 0.5
+        if self.num_answers == 0:
+            return False
+        self.num_answers -= 1
+        self.last_s = self.now
+        return True
+
+    def close(self):
+        pass
+
+
+def test_a_raylet_that_answers_no_more_is_named_within_a_minute(monkeypatch):
+    raylet, lost, named = Raylet(monkeypatch, num_answers=200), [], Event()
+    with RayletWatch(lambda line: (lost.append((line, raylet.now - raylet.last_s)), named.set())):
+        assert named.wait(60.0)
+    ((line, silent_s),) = lost
+    assert "the raylet, has not answered for 40 s" in line
+    assert 30.0 < silent_s <= 60.0
