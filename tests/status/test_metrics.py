@@ -9,6 +9,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from service.status import metrics
 from service.status.metrics import HTTP_METRICS, NUM_ENDED_RUNS, RUN_METRICS, SERVICE_METRICS
+from service.store.models import CONDITIONS
 from tests.status.conftest import serve
 from tests.status.runs import BEARER, CLIENT, append, record, status, write_runs, write_status
 
@@ -65,6 +66,16 @@ def test_metrics_of_a_run(service):
     assert value(samples, "tandem_run_condition", run="cube", condition="disk") == 0
     assert 0 <= value(samples, "tandem_run_heartbeat_age_seconds", run="cube") < 3600
     assert value(samples, "tandem_runs", state="finished") == value(samples, "tandem_runs", state="running") == 1
+
+
+def test_what_a_run_suffers_from(service):
+    """Alerts are made of it."""
+    client, runs = service
+    write_status(runs, "cube", condition="disk", warnings=("cannot write checkpoints",))
+    samples = scrape(client)
+    conditions = {name: value(samples, "tandem_run_condition", run="cube", condition=name) for name in CONDITIONS}
+    assert {name for name, holds in conditions.items() if holds} == {"disk"}
+    assert value(samples, "tandem_run_warnings", run="cube") == 1
 
 
 def test_missing_metrics_are_left_out(service):

@@ -244,10 +244,11 @@ def test_a_run_that_was_resumed_from_an_earlier_iteration(visit, home):
 def test_the_list_of_runs_is_updated_live(visit, home):
     page = visit.go().page
     page.get_by_role("link", name="cube", exact=True).focus()
-    write_status(home / "runs", "cube", num_env_steps=5000)
+    write_status(home / "runs", "cube", num_env_steps=5000, condition="disk", warnings=("cannot write",))
     write_status(home / "runs", "another")
     page.get_by_text("2 active runs, 3 runs in all.").wait_for()
     page.get_by_text(f"5,000 of 10{NBSP}k").wait_for()
+    assert page.locator("tbody .chip.warn").all_inner_texts() == ["disk"]
     assert page.evaluate("document.activeElement.textContent") == "cube"  # a keyboard does not lose its place
 
 
