@@ -146,6 +146,24 @@ def test_damaged_files(tmp_path):
         assert_problem(client.get("/v1/primitives/tiny"), 500, "failed", "latest", "damaged")
 
 
+def test_a_run_that_cannot_be_read_hides_no_other(tmp_path):
+    write_runs(tmp_path / "runs")
+    with (tmp_path / "runs" / "old" / "metrics.jsonl").open("a") as records:
+        records.write("[" * 1000 + "]" * 1000 + "\n")
+    (tmp_path / "runs" / "loop").symlink_to("loop")
+    with serve(tmp_path) as server, httpx.Client(base_url=server.url, headers=BEARER, **CLIENT) as client:
+        assert client.get("/v1/runs/old/metrics").json()["iteration"] == [1, 2, 3]
+        runs = {run["run_id"]: run for run in client.get("/v1/runs?sparkline=bob/success_rate").json()["runs"]}
+        assert {client.get(f"/v1/runs/{name}").status_code for name in runs} == {200}
+        metrics = client.get("/metrics")
+    assert runs.keys() == {"cube", "old", "loop"}
+    assert (runs["cube"]["warnings"], runs["cube"]["last_error"]) == ([], None)
+    assert "passed over: 1" in runs["old"]["warnings"][0]
+    assert "symbolic links" in runs["loop"]["last_error"]
+    assert metrics.status_code == 200
+    assert 'tandem_run_iteration{run="cube"} 3.0' in metrics.text
+
+
 class BrokenReader(DiskReader):
     """A reader with a bug."""
 
