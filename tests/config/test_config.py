@@ -166,7 +166,13 @@ def test_missing_file(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [(b"a: [1", "YAML"), (b"\xff\xfe\x00", "YAML"), (b"- 1\n- 2\n", "list"), (b"just words", "str")],
+    [
+        (b"a: [1", "YAML"),
+        (b"\xff\xfe\x00", "YAML"),
+        (b"- 1\n- 2\n", "list"),
+        (b"just words", "str"),
+        (b"seed: 1\nseed: 2\n", "'seed' is there 2"),
+    ],
 )
 def test_a_file_that_is_no_configuration(tmp_path, content, said):
     path = tmp_path / "bad.yaml"
