@@ -1,5 +1,7 @@
 """Access to every route; the routes are taken from the OpenAPI document and the app, so that none is forgotten."""
 
+from base64 import b64encode
+
 import httpx
 import pytest
 from starlette.routing import Mount, Route
@@ -30,6 +32,7 @@ REFUSED = {
     "shorter": f"Bearer {TOKEN[:-1]}",
     "empty": "Bearer",
     "another scheme": f"Basic {TOKEN}",
+    "user and password": f"Basic {b64encode(f'tandem:{TOKEN}'.encode()).decode()}",
     "not ASCII": "Bearer \u00e9\u00e9\u00e9",
 }
 

@@ -9,9 +9,11 @@ from pathlib import Path
 import httpx
 import pytest
 
+from service.status import server as module
 from service.store.disk_reader import DiskReader
 from tests.status.conftest import serve
 from tests.status.runs import BEARER, CLIENT
+from tests.store.stores import wait_until
 
 
 def resident_bytes():
@@ -62,6 +64,16 @@ def test_a_head_that_is_too_large_is_refused_before_it_is_whole(server):
         with pytest.raises(ConnectionError):
             send_all(connection, b"x: " + b"a" * 5000 + b"\r\n", times=10_000)
     assert is_well(server)
+
+
+def test_of_more_connections_than_may_be_a_request_is_refused_and_served_when_they_are_gone(home, monkeypatch):
+    monkeypatch.setattr(module, "MAX_CONNECTIONS", 4)
+    with serve(home) as server:
+        held = [connect(server) for _ in range(4)]
+        assert httpx.get(f"{server.url}/livez", **CLIENT).status_code == 503
+        for connection in held:
+            connection.close()
+        wait_until(lambda: is_well(server))
 
 
 def test_it_is_alive_while_every_thread_waits_for_a_file(server, monkeypatch):
