@@ -123,6 +123,14 @@ def test_clients_that_do_not_go_on(client, service, crowd, request_):
     assert_others_are_served(client, service)
 
 
+def test_a_head_that_is_too_large(client, service, crowd):
+    """The service itself would take it."""
+    head = b"GET /livez HTTP/1.1\r\n" + HEAD + b"connection: close\r\n" + (b"x: " + b"a" * 5000 + b"\r\n") * 10
+    (connection,) = crowd(data=head + b"\r\n")
+    assert received(connection)[:12] in (b"HTTP/1.1 400", b"")  # or the answer was lost, as nginx had closed
+    assert_others_are_served(client, service)
+
+
 def test_one_address_has_only_so_many_connections(client, service, crowd):
     half = b"POST /v1/session HTTP/1.1\r\n" + HEAD + b"content-length: 100\r\n\r\n{"
     refused = set()
