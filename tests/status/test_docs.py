@@ -18,6 +18,7 @@ from tests.status.runs import TOKEN, VIDEO, append, grid, publish, record, write
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "api.md").read_text()
+NGINX = (ROOT / "deploy" / "nginx" / "nginx.conf").read_text()
 
 
 def commands():
@@ -82,3 +83,28 @@ def test_numbers():
     assert f"{server.MAX_HEAD_BYTES // 1024} KiB of headers, {server.MAX_CONNECTIONS} connections" in TEXT
     assert f"At most {stream.MAX_STREAMS} streams" in TEXT
     assert f"After {routing._PING_INTERVAL:g} seconds without an event" in TEXT
+
+
+def test_who_covers_what():
+    """The table of attacks: what the service alone does against them, and what nginx does with the deployed file."""
+
+    def number(name):
+        return int(re.search(rf"\b{name}[ =](\d+)", NGINX)[1])
+
+    table = (ROOT / "docs" / "operations.md").read_text().split("\n### Who covers what\n\n")[1].split("\n\n")[0]
+    rows = dict(re.findall(r"^\| (.+?) \| (.+ \| .+) \|$", table, re.MULTILINE))
+    bare = {what: cells.split(" | ")[0] for what, cells in rows.items()}
+    behind = {what: cells.split(" | ")[1] for what, cells in rows.items()}
+    half, unread = "clients that send half a head or half a body", "clients that read nothing"
+    assert [what for what, cell in bare.items() if "**not covered**" in cell] == [half, unread, "listening in"]
+    assert number("client_header_timeout") == number("client_body_timeout")
+    assert behind[half].startswith(f"ended after {number('client_body_timeout')} s")
+    assert behind[unread].startswith(f"ended after {number('send_timeout')} s")
+    assert server.MAX_HEAD_BYTES == auth.MAX_BODY_BYTES
+    assert bare["long headers and bodies"] == f"{server.MAX_HEAD_BYTES // 1024} KiB each"
+    sizes = 4 * number("large_client_header_buffers 4"), number("client_max_body_size")
+    assert behind["long headers and bodies"] == "{} KiB and {} KiB".format(*sizes)
+    assert bare["many connections"].startswith(f"{server.MAX_CONNECTIONS}, then 503")
+    assert behind["many connections"].startswith(f"{number('limit_conn connections')} from an address")
+    rate = f"at most {number('rate')} a second from an address, in bursts of {number('burst')}"
+    assert behind["requests faster than their answers are read"] == rate
