@@ -231,6 +231,8 @@ def test_the_readme_begins_with_commands_that_exist():
     assert first is not None
     lines = [line.partition("#")[0].split() for line in first[1].splitlines()]
     assert [line[:2] for line in lines] == [["git", "clone"], ["cd", "tandem"], ["make", "demo"], ["make", "test"]]
+    beside = re.findall(r"^\| `(make [a-z]+)` \| about [a-z]+ minutes\b[^|]* \| [^|]+ \|$", text, re.MULTILINE)
+    assert beside == ["make demo", "make test"]  # how long it takes, and what it ends with
     phony = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert phony is not None
     assert set(re.findall(r"(?:^|`)make ([a-z]+)", text, re.MULTILINE)) <= set(phony[1].split())
