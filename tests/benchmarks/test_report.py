@@ -92,6 +92,13 @@ def test_a_page_that_says_the_shipped_recipe_is_not_made_where_another_one_was_r
         Report(docs).write()
 
 
+def test_other_pages_of_results_do_not_say_of_which_recipe_they_are():
+    """Of these the recipe is compared; logs say what it was then."""
+    pages = [DOCS.parent / "README.md", *DOCS.glob("results/*.md")]
+    said = {page.name for page in pages if SHIPPED in " ".join(page.read_text().lower().split())}
+    assert said <= {Path(page).name for page in ABOUT_THE_RECIPE} | {"log.md"}
+
+
 def test_which_recipe_a_time_to_skill_was_measured_with():
     same = study_of(SHIPS | {"seed": 7, "name": "other", "run": SHIPS["run"] | {"total_env_steps": 5}})
     assert differences(same["settings"]["recipe"]) == {}
