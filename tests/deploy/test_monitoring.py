@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from service.status.metrics import HTTP_METRICS, RUN_METRICS, SERVICE_METRICS
+from service.store.models import CONDITIONS
 from tests.deploy.files import DEPLOY, PROMETHEUS, ROOT, load, scrape_job, walk
 
 ALERTS = [
@@ -108,6 +109,11 @@ def test_alerts_say_what_is_wrong_and_where_to_read_on(group, rule):
 def test_every_documented_alert_is_one():
     section = OPERATIONS.split("\n## Alerts\n")[1].split("\n## ")[0]
     assert re.findall(r"^### (\w+)$", section, re.MULTILINE) == [rule["alert"] for _, rule in ALERTS]
+
+
+def test_every_condition_of_a_run_has_an_alert():
+    asked = [re.fullmatch(r'tandem_run_condition\{condition="(\w+)"\} == 1', rule["expr"]) for _, rule in ALERTS]
+    assert {found[1] for found in asked if found is not None} == set(CONDITIONS) - {"well"}
 
 
 def test_every_trouble_has_an_alert_that_was_seen_to_fire():
