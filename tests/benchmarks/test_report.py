@@ -136,6 +136,12 @@ def test_every_rate_of_a_table_in_the_readme_has_its_number_of_seeds():
     assert [rate for rate in rates if not re.fullmatch(r"\d+ % \([1-9]\d*\)", rate)] == []
 
 
+def test_the_readme_says_how_many_checks_of_the_deployment_there_were_and_all_passed():
+    checks = json.loads((DOCS / "results" / "deployed.json").read_text())["checks"]
+    assert f"[{len(checks)} checks](docs/results/deployed.md)" in (DOCS.parent / "README.md").read_text()
+    assert [check["name"] for check in checks if check["outcome"] != "passed"] == []
+
+
 @pytest.mark.parametrize("page", [*(page for page in PAGES if page.startswith("results/")), "results/robust.md"])
 def test_words_by_hand_have_no_rates_of_their_own(page):
     asked = re.compile("9[05] %")  # what was asked for, and how sure an interval is, are no results
