@@ -35,6 +35,11 @@ def test_the_doors_are_those_in_the_comment():
     assert published == set(re.findall(r"\b(?:port |at )(\d{4})\b", heading))
 
 
+def test_the_status_service_is_reached_through_nginx_alone():
+    assert "ports" not in SERVICES["status"]
+    assert "../nginx/nginx.conf:/etc/nginx/nginx.conf:ro" in SERVICES["nginx"]["volumes"]
+
+
 @pytest.mark.parametrize("name", SERVICES)
 def test_secrets_and_volumes_and_files_are_there(name):
     service, tree = SERVICES[name], compose()
