@@ -17,15 +17,28 @@ from service.store.run_directory import RunDirectory
 from tests.runs.runs import ROOT, assert_one_line, is_alive, write_yaml
 
 PATIENCE_S = 300.0
+SOONER = """
+from contextlib import contextmanager
+from service.cluster import ray_connection
+real = ray_connection.connected
+@contextmanager
+def connected(*arguments):
+    with real(*arguments):
+        from service.cluster import watch  # not before: Ray takes what it is told when it is imported
+        watch.SILENT_S, watch.LOST_S = 1.0, 4.0
+        yield
+ray_connection.connected = connected
+"""
+"""Has a frozen raylet noticed sooner."""
 
 
 @contextmanager
-def run_on_ray(home, before="pass"):
+def run_on_ray(home, before=""):
     """A run that ends only by what is done to it; its process has done ``before`` first."""
     paths = {"--config": write_yaml(home / "tiny.yaml"), "--run-dir": home / "run", "--registry": home / "registry"}
     arguments = [part for pair in paths.items() for part in map(str, pair)]
     endless = ("--set", "run.total_env_steps=1_000_000_000", "--set", "run.checkpoint_interval=1_000_000")
-    code = f"{before}; from service.cli.main import main; main()"
+    code = f"{before}\nfrom service.cli.main import main; main()"
     command = [sys.executable, "-c", code, "pretrain", "--runtime", "ray", "--status", "off", "--num-actors", "1"]
     with (home / "out").open("w") as out, (home / "err").open("w") as err:
         process = subprocess.Popen([*command, *arguments, *endless], cwd=ROOT, stdout=out, stderr=err)
@@ -73,9 +86,8 @@ def assert_on_loopback(pid):
 
 def test_a_raylet_that_is_frozen_for_ever_ends_the_run(tmp_path):
     """No call of the driver needs to come back for that, and nobody is blamed for it, or replaced in vain."""
-    sooner = "from service.cluster import watch; watch.SILENT_S, watch.LOST_S = 1.0, 4.0"
     directory = RunDirectory(tmp_path / "run")
-    with run_on_ray(tmp_path, sooner) as process:
+    with run_on_ray(tmp_path, SOONER) as process:
         wait_until(process, lambda: directory.metrics_file.exists() and len(read_jsonl(directory.metrics_file)) >= 2)
         below = descendants(process.pid)
         assert_on_loopback(process.pid)
