@@ -1,12 +1,16 @@
 """Mutation testing: change one thing in the code that learns, and see whether a test fails.
 
-    pip install cosmic-ray==8.7.0          # anywhere; this program needs it, the project does not
-    python -m tools.mutation --python .venv/bin/python --num 200 --json docs/results/mutation.json
+    pip install --target DIR cosmic-ray==8.7.0    # for this program alone: it brings packages along
+    pip install --target COV --no-deps coverage==7.10.7 pytest-cov==7.0.0    # for the project's own tests
+    PYTHONPATH=DIR python -m tools.mutation --python .venv/bin/python --coverage COV --json docs/results/mutation.json
 
 It draws places in the code, all alike, and for each one of the operators of Cosmic Ray that change something there. A
-mutant whose syntax tree is the same without its annotations is drawn again: nothing of it would ever run. The quick
-tests of the mutant's own room come first, then all quick tests, then the slow ones of its own room. What no test
-notices survives: either it behaves as before, or a test is missing. That takes about half a minute a mutant.
+mutant whose syntax tree is the same without its annotations is drawn again: nothing of it would ever run. The tests
+run once without any change, and show which lines each test file runs. A mutant is judged by all tests of the files
+that run its line, quick ones first. Where none does, because the line runs at import or in a process of its own, the
+judges are the quick tests of its room, all quick ones, and the slow ones of its room. What no test notices survives:
+either it behaves as before, or a test is missing. That takes a quarter of a minute a mutant. Stopped and begun again,
+it goes on with what the JSON file does not have.
 """
 
 from __future__ import annotations
@@ -14,7 +18,9 @@ from __future__ import annotations
 import argparse
 import ast
 import difflib
+import json
 import shutil
+import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -23,19 +29,24 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from queue import SimpleQueue
+from threading import Lock
 from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks.measuring import ROOT, machine, write_json
+from benchmarks.report.measured import SURVIVED
 
 PACKAGES = (
     "actors", "base", "cluster", "config", "envs", "export", "generator", "learner", "methods", "policies", "registry",
     "robot", "runs", "status", "store",
 )  # fmt: skip
 """Rooms of ``service`` that decide something: all but ``cli``, which is thin, and ``media``, which draws."""
-TIMEOUT_S = 400.0
+TIMEOUT_S = 900.0
+"""More than the slow tests of any room take; a mutant that makes them take longer is killed."""
+Covering = dict[tuple[str, int], set[str]]
+"""Test files by file and line that they run; neither what runs at import nor what runs in another process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,19 +84,60 @@ def draw_mutants(files: Sequence[Path], num: int, seed: int) -> Iterator[Mutant]
             return
 
 
-def judge(mutant: Mutant, copy: Path, python: Path) -> str:
+def judge(mutant: Mutant, copy: Path, python: Path, covering: Covering) -> str:
     """The test that noticed, as "killed by ..."; else "survived"."""
     target = copy / mutant.file
     original = target.read_text(encoding="utf-8")
+    own = f"tests/{Path(mutant.file).parts[1]}"
+    files = set().union(*(covering.get((mutant.file, line), ()) for line in _statement(original, mutant.line)))
+    nearest = sorted(files, key=lambda file: (not file.startswith(own), file))
+    rounds = [(*nearest, "-m", speed) for speed in ("not slow", "slow")]
+    if not files:
+        rounds = [(own, "-m", "not slow"), ("tests", "-m", "not slow"), (own, "-m", "slow")]
     target.write_text(mutant.code, encoding="utf-8")
     try:
-        own = f"tests/{Path(mutant.file).parts[1]}"
-        for tests in (own, "-m", "not slow"), ("tests", "-m", "not slow"), (own, "-m", "slow"):
-            if failure := _failure(tests, copy, python):
-                return f"killed by {failure}"
-        return "survived"
+        failures = (_failure(tests, copy, python) for tests in rounds)
+        return next((f"killed by {failure}" for failure in failures if failure), SURVIVED)
     finally:
         target.write_text(original, encoding="utf-8")
+
+
+def cover(copy: Path, python: Path, coverage: Path) -> Covering:
+    """Run all tests without any change; what each test file runs.
+
+    Raises:
+        SystemExit: one fails, so every mutant would seem to be killed.
+    """
+    measured = ("-n", "2", "--dist", "loadfile", "--cov=service", "--cov-context=test", "--cov-report=")
+    failure = _failure(("tests", *measured), copy, python, PYTHONPATH=f"{copy}:{coverage}")
+    if failure:
+        raise SystemExit(f"{failure} fails without any change: mend that first")
+    found: dict[tuple[str, int], set[str]] = {}
+    with sqlite3.connect(copy / ".coverage") as database:
+        # As ``CoverageData.contexts_by_lineno`` reads it: a bit of ``numbits`` is a line.
+        rows = database.execute(
+            "SELECT file.path, context.context, line_bits.numbits FROM line_bits "
+            "JOIN file ON file.id = file_id JOIN context ON context.id = context_id WHERE context.context != ''"
+        )
+        for path, context, bits in rows:
+            name, test = str(Path(path).relative_to(copy)), context.split("::")[0]
+            for line in np.flatnonzero(np.unpackbits(np.frombuffer(bits, np.uint8), bitorder="little")):
+                found.setdefault((name, int(line)), set()).add(test)
+    return found
+
+
+def _statement(code: str, line: int) -> range:
+    """The lines of the innermost statement with this line; of one with a body its head."""
+    around = [
+        node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.stmt) and node.lineno <= line <= _end(node)
+    ]
+    innermost = min(around, key=lambda node: _end(node) - node.lineno)
+    body = getattr(innermost, "body", None)
+    return range(innermost.lineno, max(innermost.lineno, body[0].lineno - 1 if body else _end(innermost)) + 1)
+
+
+def _end(node: ast.stmt) -> int:
+    return node.end_lineno or node.lineno
 
 
 def _places(code: str) -> dict[tuple[int, int], list[tuple[str, Any, int]]]:
@@ -137,13 +189,13 @@ def _left_out(directory: str, names: list[str]) -> list[str]:
     return [name for name in names if directory == str(ROOT) and name in (".venv", ".git", "runs", "registry")]
 
 
-def _failure(tests: Sequence[str], copy: Path, python: Path) -> str:
+def _failure(tests: Sequence[str], copy: Path, python: Path, **environment: str) -> str:
     """What failed first, in a line; nothing if all pass."""
-    environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1", "HOME": str(Path.home())}
-    command = [str(python), "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", *tests]
+    usual = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1", "HOME": str(Path.home())}
+    command = [str(python), "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
     try:
         done = subprocess.run(
-            command, cwd=copy, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
+            command, cwd=copy, env=usual | environment, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
         )
     except subprocess.TimeoutExpired:
         return f"{' '.join(tests)}, which took {TIMEOUT_S:.0f} s"
@@ -153,35 +205,42 @@ def _failure(tests: Sequence[str], copy: Path, python: Path) -> str:
     return failed[0][:300] if failed else f"{' '.join(tests)}, exit status {done.returncode}"
 
 
-def run(num: int, seed: int, python: Path, parallel: int) -> list[dict[str, Any]]:
-    """Draw and judge mutants in copies of the project; tells of each."""
+def run(settings: dict[str, Any], python: Path, coverage: Path, parallel: int, path: Path) -> list[dict[str, Any]]:
+    """Draw and judge mutants in copies of the project; tell of each, and write all so far."""
     files = sorted(path for package in PACKAGES for path in (ROOT / "service" / package).rglob("*.py"))
+    before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    same = before.get("settings") == settings
+    judged = {(each["file"], each["line"], each["operator"]): each for each in before["mutants"]} if same else {}
     with tempfile.TemporaryDirectory() as place, ThreadPoolExecutor(parallel) as executor:
         copies: SimpleQueue[Path] = SimpleQueue()
         for number in range(parallel):
             copies.put(copy := Path(place) / str(number))
             shutil.copytree(ROOT, copy, ignore=_left_out)
+        covering = cover(copy, python, coverage)
 
-        def unchanged(tests: Sequence[str]) -> None:
-            copy = copies.get()
-            if failure := _failure(tests, copy, python):  # else every mutant would seem to be killed
-                raise SystemExit(f"{failure} fails without any change: mend that first")
-            copies.put(copy)
-
-        def one(mutant: Mutant) -> dict[str, Any]:
+        def one(mutant: Mutant) -> None:
             copy = copies.get()
             try:
-                outcome = judge(mutant, copy, python)
+                outcome = judge(mutant, copy, python, covering)
             finally:
                 copies.put(copy)
             diff = mutant.diff((ROOT / mutant.file).read_text(encoding="utf-8"))
             print(f"{mutant.file}:{mutant.line} {outcome}", *diff, sep="\n  ", flush=True)
             kept = {key: value for key, value in asdict(mutant).items() if key != "code"}
-            return {**kept, "diff": diff, "outcome": outcome}
+            with writing:
+                judged[mutant.file, mutant.line, mutant.operator] = {**kept, "diff": diff, "outcome": outcome}
+                result = {
+                    "tool": "mutation",
+                    "recorded": machine(),
+                    "settings": settings,
+                    "mutants": [*judged.values()],
+                }
+                write_json(path, result)
 
-        rooms = [(f"tests/{package}", "-m", "slow") for package in PACKAGES]
-        list(executor.map(unchanged, [("tests", "-m", "not slow"), *rooms]))
-        return list(executor.map(one, draw_mutants(files, num, seed)))
+        writing = Lock()
+        drawn = list(draw_mutants(files, settings["num"], settings["seed"]))
+        list(executor.map(one, [each for each in drawn if (each.file, each.line, each.operator) not in judged]))
+    return list(judged.values())
 
 
 def main() -> int:
@@ -191,15 +250,14 @@ def main() -> int:
     add("--num", type=int, default=200, help="mutants (default: %(default)s)")
     add("--seed", type=int, default=0, help="of the draw (default: %(default)s)")
     add("--python", type=Path, metavar="FILE", default=Path(sys.executable), help="runs the tests")
+    add("--coverage", type=Path, metavar="DIR", required=True, help="where coverage and pytest-cov are")
     add("--parallel", type=int, default=2, help="mutants at once (default: %(default)s)")
-    add("--json", type=Path, metavar="FILE", help="where to write them all")
+    add("--json", type=Path, metavar="FILE", required=True, help="where to write them all")
     given = parser.parse_args()
-    mutants = run(given.num, given.seed, given.python.absolute(), given.parallel)
-    survivors = [each for each in mutants if each["outcome"] == "survived"]
+    settings = {"num": given.num, "seed": given.seed, "packages": list(PACKAGES), "timeout_s": TIMEOUT_S}
+    mutants = run(settings, given.python.absolute(), given.coverage.absolute(), given.parallel, given.json)
+    survivors = [each for each in mutants if each["outcome"] == SURVIVED]
     print(f"{len(mutants) - len(survivors)} of {len(mutants)} killed")
-    if given.json:
-        settings = {"num": given.num, "seed": given.seed, "packages": PACKAGES, "timeout_s": TIMEOUT_S}
-        write_json(given.json, {"tool": "mutation", "recorded": machine(), "settings": settings, "mutants": mutants})
     return 0
 
 
