@@ -6,11 +6,11 @@
 
 It draws places in the code, all alike, and for each one of the operators of Cosmic Ray that change something there. A
 mutant whose syntax tree is the same without its annotations is drawn again: nothing of it would ever run. The tests
-run once without any change, and show which lines each test file runs. A mutant is judged by all tests of the files
-that run its line, quick ones first. Where none does, because the line runs at import or in a process of its own, the
-judges are the quick tests of its room, all quick ones, and the slow ones of its room. What no test notices survives:
-either it behaves as before, or a test is missing. That takes a quarter of a minute a mutant. Stopped and begun again,
-it goes on with what the JSON file does not have.
+run once without any change, and show which lines each test file runs. A mutant is judged by the files that run its
+line: the quick tests of its own room, those of the other rooms, and the slow ones of its own. Where no file runs it,
+because the line runs at import or in a process of its own, all quick tests judge. What no test notices survives:
+either it behaves as before, or a test is missing. Stopped and begun again on the same commit, it goes on with what the
+JSON file and the coverage beside it do not have.
 """
 
 from __future__ import annotations
@@ -90,8 +90,9 @@ def judge(mutant: Mutant, copy: Path, python: Path, covering: Covering) -> str:
     original = target.read_text(encoding="utf-8")
     own = f"tests/{Path(mutant.file).parts[1]}"
     files = set().union(*(covering.get((mutant.file, line), ()) for line in _statement(original, mutant.line)))
-    nearest = sorted(files, key=lambda file: (not file.startswith(own), file))
-    rounds = [(*nearest, "-m", speed) for speed in ("not slow", "slow")]
+    of_room = sorted(file for file in files if file.startswith(f"{own}/"))
+    rounds = [(*of_room, "-m", "not slow"), (*sorted(files - {*of_room}), "-m", "not slow"), (*of_room, "-m", "slow")]
+    rounds = [tests for tests in rounds if len(tests) > 2]  # without a file it would be all tests
     if not files:
         rounds = [(own, "-m", "not slow"), ("tests", "-m", "not slow"), (own, "-m", "slow")]
     target.write_text(mutant.code, encoding="utf-8")
@@ -102,25 +103,29 @@ def judge(mutant: Mutant, copy: Path, python: Path, covering: Covering) -> str:
         target.write_text(original, encoding="utf-8")
 
 
-def cover(copy: Path, python: Path, coverage: Path) -> Covering:
-    """Run all tests without any change; what each test file runs.
+def cover(copy: Path, python: Path, coverage: Path, kept: Path) -> None:
+    """Run all tests without any change, and keep in a database which lines each of them runs.
 
     Raises:
         SystemExit: one fails, so every mutant would seem to be killed.
     """
     measured = ("-n", "2", "--dist", "loadfile", "--cov=service", "--cov-context=test", "--cov-report=")
-    failure = _failure(("tests", *measured), copy, python, PYTHONPATH=f"{copy}:{coverage}")
-    if failure:
+    if failure := _failure(("tests", *measured), copy, python, PYTHONPATH=f"{copy}:{coverage}"):
         raise SystemExit(f"{failure} fails without any change: mend that first")
+    shutil.move(copy / ".coverage", kept)
+
+
+def read_coverage(kept: Path) -> Covering:
+    """What ``cover`` has kept."""
     found: dict[tuple[str, int], set[str]] = {}
-    with sqlite3.connect(copy / ".coverage") as database:
+    with sqlite3.connect(kept) as database:
         # As ``CoverageData.contexts_by_lineno`` reads it: a bit of ``numbits`` is a line.
         rows = database.execute(
             "SELECT file.path, context.context, line_bits.numbits FROM line_bits "
             "JOIN file ON file.id = file_id JOIN context ON context.id = context_id WHERE context.context != ''"
         )
         for path, context, bits in rows:
-            name, test = str(Path(path).relative_to(copy)), context.split("::")[0]
+            name, test = f"service/{path.rpartition('/service/')[2]}", context.split("::")[0]
             for line in np.flatnonzero(np.unpackbits(np.frombuffer(bits, np.uint8), bitorder="little")):
                 found.setdefault((name, int(line)), set()).add(test)
     return found
@@ -186,7 +191,7 @@ def _without_annotations(code: str) -> str:
 
 def _left_out(directory: str, names: list[str]) -> list[str]:
     """What is not copied: big, and no test needs it."""
-    return [name for name in names if directory == str(ROOT) and name in (".venv", ".git", "runs", "registry")]
+    return [name for name in names if directory == str(ROOT) and name in (".venv", "runs", "registry")]
 
 
 def _failure(tests: Sequence[str], copy: Path, python: Path, **environment: str) -> str:
@@ -209,14 +214,18 @@ def run(settings: dict[str, Any], python: Path, coverage: Path, parallel: int, p
     """Draw and judge mutants in copies of the project; tell of each, and write all so far."""
     files = sorted(path for package in PACKAGES for path in (ROOT / "service" / package).rglob("*.py"))
     before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    same = before.get("settings") == settings
+    recorded = {"tool": "mutation", "recorded": machine(), "settings": settings}
+    same = before and (before["settings"], before["recorded"]["git_commit"]) == (settings, machine()["git_commit"])
     judged = {(each["file"], each["line"], each["operator"]): each for each in before["mutants"]} if same else {}
     with tempfile.TemporaryDirectory() as place, ThreadPoolExecutor(parallel) as executor:
         copies: SimpleQueue[Path] = SimpleQueue()
         for number in range(parallel):
             copies.put(copy := Path(place) / str(number))
             shutil.copytree(ROOT, copy, ignore=_left_out)
-        covering = cover(copy, python, coverage)
+        kept = path.with_suffix(".coverage")
+        if not same or not kept.exists():
+            cover(copy, python, coverage, kept)
+        covering = read_coverage(kept)
 
         def one(mutant: Mutant) -> None:
             copy = copies.get()
@@ -229,13 +238,7 @@ def run(settings: dict[str, Any], python: Path, coverage: Path, parallel: int, p
             kept = {key: value for key, value in asdict(mutant).items() if key != "code"}
             with writing:
                 judged[mutant.file, mutant.line, mutant.operator] = {**kept, "diff": diff, "outcome": outcome}
-                result = {
-                    "tool": "mutation",
-                    "recorded": machine(),
-                    "settings": settings,
-                    "mutants": [*judged.values()],
-                }
-                write_json(path, result)
+                write_json(path, recorded | {"mutants": [*judged.values()]})
 
         writing = Lock()
         drawn = list(draw_mutants(files, settings["num"], settings["seed"]))
