@@ -22,7 +22,7 @@ from service.store.models import RunReader
 START_TIMEOUT_S = 10.0
 STOP_TIMEOUT_S = 5.0
 MAX_CONNECTIONS = 512
-"""Open at once; of one more, a request is answered with 503."""
+"""Where so many are open, the asking one among them, a request is answered with 503."""
 MAX_HEAD_BYTES = 64 * 1024
 """Request line and headers; a browser's have one or two kilobytes."""
 _GRACE_S = 2
