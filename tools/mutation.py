@@ -2,15 +2,15 @@
 
     pip install --target DIR cosmic-ray==8.7.0    # for this program alone: it brings packages along
     pip install --target COV --no-deps coverage==7.10.7 pytest-cov==7.0.0    # for the project's own tests
-    PYTHONPATH=DIR python -m tools.mutation --python .venv/bin/python --coverage COV --json docs/results/mutation.json
+    PYTHONPATH=DIR python -m tools.mutation --python .venv/bin/python --coverage COV --json /tmp/mutation.json
 
 It draws places in the code, all alike, and for each one of the operators of Cosmic Ray that change something there. A
 mutant whose syntax tree is the same without its annotations is drawn again: nothing of it would ever run. The tests
 run once without any change, and show which lines each test file runs. A mutant is judged by the files that run its
 line: the quick tests of its own room, those of the other rooms, and the slow ones of its own. Where no file runs it,
-because the line runs at import or in a process of its own, all quick tests judge. What no test notices survives:
-either it behaves as before, or a test is missing. Stopped and begun again on the same commit, it goes on with what the
-JSON file and the coverage beside it do not have.
+because the line runs at import or in a process of its own, it is all quick tests, and the slow ones of its room. What
+no test notices survives: either it behaves as before, or a test is missing. Stopped and begun again on the same commit,
+it goes on with what the JSON file and the coverage beside it do not have.
 """
 
 from __future__ import annotations
@@ -215,7 +215,9 @@ def run(settings: dict[str, Any], python: Path, coverage: Path, parallel: int, p
     files = sorted(path for package in PACKAGES for path in (ROOT / "service" / package).rglob("*.py"))
     before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     recorded = {"tool": "mutation", "recorded": machine(), "settings": settings}
-    same = before and (before["settings"], before["recorded"]["git_commit"]) == (settings, machine()["git_commit"])
+    # What this program writes may lie in the tree, which is dirty from then on.
+    commits = [each["git_commit"].removesuffix("-dirty") for each in (before.get("recorded", machine()), machine())]
+    same = before.get("settings") == settings and commits[0] == commits[1]
     judged = {(each["file"], each["line"], each["operator"]): each for each in before["mutants"]} if same else {}
     with tempfile.TemporaryDirectory() as place, ThreadPoolExecutor(parallel) as executor:
         copies: SimpleQueue[Path] = SimpleQueue()
