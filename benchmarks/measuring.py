@@ -159,7 +159,7 @@ def write_json(path: Path, result: dict[str, Any]) -> None:
 def to_text(value: Any) -> str:
     """JSON for people and for ``git diff``: indented, with every list of plain values on a single line."""
     text = json.dumps(value, indent=1, allow_nan=False)
-    return _PLAIN_LIST.sub(lambda found: " ".join(found[0].split()), text) + "\n"
+    return _PLAIN_LIST.sub(lambda found: " ".join(map(str.strip, found[0].splitlines())), text) + "\n"
 
 
 # --- the command line of a benchmark ----------------------------------------------------------------------------------

@@ -60,8 +60,9 @@ class Mutant:
     code: str
     """The whole file, changed."""
 
-    def diff(self, original: str) -> list[str]:
+    def diff(self) -> list[str]:
         """The lines that differ."""
+        original = (ROOT / self.file).read_text(encoding="utf-8")
         lines = difflib.unified_diff(original.splitlines(), self.code.splitlines(), n=0, lineterm="")
         return [line for line in lines if not line.startswith(("---", "+++", "@@"))]
 
@@ -89,7 +90,7 @@ def judge(mutant: Mutant, copy: Path, python: Path, covering: Covering) -> str:
     target = copy / mutant.file
     original = target.read_text(encoding="utf-8")
     own = f"tests/{Path(mutant.file).parts[1]}"
-    files = set().union(*(covering.get((mutant.file, line), ()) for line in _statement(original, mutant.line)))
+    files = set().union(*(covering.get((mutant.file, line), ()) for line in statement(original, mutant.line)))
     of_room = sorted(file for file in files if file.startswith(f"{own}/"))
     rounds = [(*of_room, "-m", "not slow"), (*sorted(files - {*of_room}), "-m", "not slow"), (*of_room, "-m", "slow")]
     rounds = [tests for tests in rounds if len(tests) > 2]  # without a file it would be all tests
@@ -131,18 +132,25 @@ def read_coverage(kept: Path) -> Covering:
     return found
 
 
-def _statement(code: str, line: int) -> range:
+def statement(code: str, line: int) -> range:
     """The lines of the innermost statement with this line; of one with a body its head."""
-    around = [
-        node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.stmt) and node.lineno <= line <= _end(node)
-    ]
-    innermost = min(around, key=lambda node: _end(node) - node.lineno)
+    statements = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.stmt)]
+    innermost = min((node for node in statements if _begin(node) <= line <= _end(node)), key=_length)
     body = getattr(innermost, "body", None)
-    return range(innermost.lineno, max(innermost.lineno, body[0].lineno - 1 if body else _end(innermost)) + 1)
+    return range(_begin(innermost), max(innermost.lineno, _begin(body[0]) - 1 if body else _end(innermost)) + 1)
+
+
+def _begin(node: ast.stmt) -> int:
+    decorators: list[ast.expr] = getattr(node, "decorator_list", [])
+    return min(node.lineno, *(each.lineno for each in decorators)) if decorators else node.lineno
 
 
 def _end(node: ast.stmt) -> int:
     return node.end_lineno or node.lineno
+
+
+def _length(node: ast.stmt) -> int:
+    return _end(node) - _begin(node)
 
 
 def _places(code: str) -> dict[tuple[int, int], list[tuple[str, Any, int]]]:
@@ -218,7 +226,7 @@ def run(settings: dict[str, Any], python: Path, coverage: Path, parallel: int, p
     # What this program writes may lie in the tree, which is dirty from then on.
     commits = [each["git_commit"].removesuffix("-dirty") for each in (before.get("recorded", machine()), machine())]
     same = before.get("settings") == settings and commits[0] == commits[1]
-    judged = {(each["file"], each["line"], each["operator"]): each for each in before["mutants"]} if same else {}
+    judged = {(each["file"], *each["diff"]): each for each in before["mutants"]} if same else {}
     with tempfile.TemporaryDirectory() as place, ThreadPoolExecutor(parallel) as executor:
         copies: SimpleQueue[Path] = SimpleQueue()
         for number in range(parallel):
@@ -235,16 +243,16 @@ def run(settings: dict[str, Any], python: Path, coverage: Path, parallel: int, p
                 outcome = judge(mutant, copy, python, covering)
             finally:
                 copies.put(copy)
-            diff = mutant.diff((ROOT / mutant.file).read_text(encoding="utf-8"))
+            diff = mutant.diff()
             print(f"{mutant.file}:{mutant.line} {outcome}", *diff, sep="\n  ", flush=True)
             kept = {key: value for key, value in asdict(mutant).items() if key != "code"}
             with writing:
-                judged[mutant.file, mutant.line, mutant.operator] = {**kept, "diff": diff, "outcome": outcome}
+                judged[mutant.file, *diff] = {**kept, "diff": diff, "outcome": outcome}
                 write_json(path, recorded | {"mutants": [*judged.values()]})
 
         writing = Lock()
         drawn = list(draw_mutants(files, settings["num"], settings["seed"]))
-        list(executor.map(one, [each for each in drawn if (each.file, each.line, each.operator) not in judged]))
+        list(executor.map(one, [each for each in drawn if (each.file, *each.diff()) not in judged]))
     return list(judged.values())
 
 

@@ -22,6 +22,7 @@ def test_pieces_come_one_after_the_other_behind_what_is_there(path):
     Appender(path).append_bytes(b"c")
     appender.append_bytes(b"d")
     assert path.read_bytes() == b"abcd"
+    assert path.stat().st_mode & 0o111 == 0  # nobody runs it
     path.unlink()
     appender.append_bytes(b"e")  # a file that was removed begins anew
     assert path.read_bytes() == b"e"

@@ -64,11 +64,11 @@ def test_a_plain_line_every_ten_seconds(clock):
 
 
 def test_what_was_done_before_does_not_count_as_fast(clock):
-    with Display(console(), get_time=clock) as shown, doing("learning", 1000, "env steps", done=900) as task:
+    with Display(console(), get_time=clock) as shown, doing("learning", 1000, "env steps", done=902) as task:
         for _ in range(2):
-            clock.now_s += 1861.5
-            task.advance(40)
-    assert lines(shown)[1:] == ["learning: 980 of 1,000 env steps, 0.021/s, 1:02:03, 15:31 left"]
+            clock.now_s += 1875.0
+            task.advance(25)
+    assert lines(shown)[1:] == ["learning: 952 of 1,000 env steps, 0.013/s, 1:02:30, 1:00:00 left"]
 
 
 def test_what_nobody_can_count_is_said_at_once():
@@ -109,12 +109,12 @@ def test_a_terminal_is_left_as_if_there_had_been_nothing(clock):
         with doing("evaluating [goals]", 100, "episodes") as task:
             task.note = "success 5%"
             for _ in range(2):
-                clock.now_s += 1.0
-                task.advance(5)
+                clock.now_s += 2.0
+                task.advance(19)
             answer("stopping after this iteration")
             with doing("drawing", 10, "pictures"):
                 wait_for("0 of 10 pictures", shown)
-            for text in ("evaluating [goals]", "10 of 100 episodes, 5/s, 0:02, 0:18 left", "success 5%"):
+            for text in ("evaluating [goals]", "38 of 100 episodes, 9.5/s, 0:04, 0:07 left", "success 5%"):
                 wait_for(text, shown)
             wait_for("stopping after this iteration", shown)
         assert screen(shown) == []

@@ -122,9 +122,10 @@ def test_one_actor_plays_and_learns_what_one_process_does_and_stops_at_once(tmp_
         asked.append(run.iteration)
 
     config = tiny_config(total_env_steps=ENDLESS, checkpoint_interval=10**6)
-    _, result = run_cluster(tmp_path / "ray", config, look, num_actors=1)
+    run, result = run_cluster(tmp_path / "ray", config, look, num_actors=1)
     assert (result.reason, [result.iteration]) == ("interrupted", asked)  # no other round was waited for
     assert CheckpointStore(tmp_path / "ray" / "checkpoints", keep=1).steps()[-1] == result.iteration
+    assert run.method.grid().iteration == result.iteration
     # Only the learner has torch: an actor with it takes three times the memory and comes up three times as slowly.
     assert torch == {"rollout-0": False, "learner": True, "generator": False}
     # Workers that compute give way to those that answer.

@@ -9,6 +9,7 @@ from service.base.parsing import parse_yaml
 from service.config import WorkspaceConfig, dump_config, load_config
 from service.config.robot import RobotConfig
 from service.config.self_play import SelfPlayConfig
+from tests.methods.trials import small_trial
 from tests.runs.runs import assert_one_line
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -203,3 +204,8 @@ def test_self_imitation_of_turns_that_no_reward_reaches_is_refused():
         load_config(None, how)
     assert len(str(error.value)) < 500  # not the whole configuration
     load_config(None, [*how, "game.alice_novelty_reward=5"])
+
+
+def test_a_task_that_goes_on_stays_in_its_world_unless_another_is_named():
+    saved, given = small_trial(world={"friction": 0.5}), small_trial(world={"friction": 0.6})
+    assert (small_trial().as_in(saved), given.as_in(saved)) == (saved, given)

@@ -1,6 +1,7 @@
 """The six downstream tasks: where things are, what a wall and a box do, and that every one can be solved."""
 
 import warnings
+from contextlib import closing
 from pathlib import Path
 
 import gymnasium
@@ -165,6 +166,8 @@ class TestEnvironment:
         many = gymnasium.make_vec(made.spec.id, 2, config=CONFIG)
         assert isinstance(many, TabletopVectorEnv)
         assert many.max_episode_steps == EPISODE_STEPS
+        with closing(TabletopVectorEnv(config=CONFIG)) as one:
+            assert one.num_envs == 1
         assert data_equivalence(few.reset(seed=7), many.reset(seed=7), exact=True)
         rng = np.random.default_rng(1)
         for _ in range(2 * EPISODE_STEPS + 2):

@@ -22,7 +22,7 @@ from service.registry.publishing import publish_run
 from service.registry.registry import Registry
 from service.runs.train import open_run
 from service.store.run_directory import RunDirectory
-from tests.runs.runs import TREE, assert_one_line, assert_same_run, play
+from tests.runs.runs import TREE, assert_one_line, assert_same_run, play, read_lines
 
 HOW = {"num_worlds": 8, "episode_steps": 6, "gradient_steps": 3, "batch_size": 16}
 
@@ -208,6 +208,7 @@ def test_a_run_is_published_with_its_teacher_as_parent_and_is_exact_when_resumed
     run_to_end(tmp_path / "part", config, resume=True)
     assert_same_run(tmp_path / "part", tmp_path / "whole")
     assert whole.method.grid().cells
+    assert {row["world/num_broken"] for row in read_lines(tmp_path / "whole" / "metrics.jsonl")} == {0.0}
     registry = Registry(root / "registry")
     published = publish_run(whole.directory, registry, config, whole.method.parameters(), {})
     assert registry.manifest(str(published)).parent == str(version)
@@ -223,7 +224,9 @@ def test_a_run_of_distillation_can_be_begun_from_as_well(taught, tmp_path):
     assert start.networks.keys() == {"bob/policy"}
     for name, array in first.method.parameters().items():
         np.testing.assert_array_equal(start.networks["bob/policy"][name], array)
-    run_to_end(tmp_path / "again", config, start)
+    world = config.world.model_dump(mode="json") | {"obstacles": [{"shape": "box", "size_m": [0.06, 0.06, 0.1]}]}
+    config = parse_config(config.model_dump(mode="json") | {"world": world}, where="a test")
+    run_to_end(tmp_path / "again", config, start)  # among obstacles, which this teacher does not see
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -160,3 +161,9 @@ def test_inputs_of_a_wrong_size_are_refused() -> None:
         numpy_policy.primitives(np.zeros(14, dtype=np.float32))
     with pytest.raises(PolicyError, match=r"weights: expected shape \(\.\.\., 4\), got \(5, 3\)"):
         numpy_policy.compose(np.zeros((5, 11), dtype=np.float32), np.ones((5, 3), dtype=np.float32))
+
+
+def test_a_file_of_parameters_runs_no_code(tmp_path: Path) -> None:
+    np.savez(tmp_path / "network.npz", function=np.array([print], dtype=object))
+    with pytest.raises(ValueError, match="allow_pickle"):
+        forward.load(tmp_path / "network.npz")

@@ -111,6 +111,8 @@ def test_what_is_there_is_whole_small_and_of_no_machine() -> None:
     for name in registry.names():
         (version,) = registry.versions(name)
         assert registry.aliases(name) == {"champion": version.number, "latest": version.number}
+        file = BUNDLED / "models" / name / "versions" / str(version.number)
+        assert registry.manifest(name).to_bytes() == file.read_bytes()  # as who fetches it writes it
         texts = list(_texts(registry.manifest(name).model_dump(mode="json")))
         assert name in texts
         assert [text for text in texts if text.startswith(("/", "~"))] == []

@@ -61,7 +61,7 @@ def test_skills_and_orchestrators_have_cards_of_their_own(registry: Registry, pu
     head, body = parts(model_card(registry.manifest(str(skills))))
     assert "skills" in head["tags"]
     assert "model-index" not in head
-    for said in ("found by LSD", "| `coverage` | 0.25 |", 'load("skills@1"', PAPERS["lsd"][1]):
+    for said in ("found by LSD", "| robot | panda |", "| `coverage` | 0.25 |", 'load("skills@1"', PAPERS["lsd"][1]):
         assert said in body
     head, body = parts(model_card(registry.manifest(str(pushes)), licence="mit"))
     assert head["license"] == "mit"

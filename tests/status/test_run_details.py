@@ -69,3 +69,4 @@ def test_a_configuration_that_cannot_be_read(tmp_path):
     (tmp_path / "config.yaml").write_text("[" * 5000)
     assert "nested" in run_details.setup(status("cube"), tmp_path, tmp_path).problem
     assert run_details.setup(status("cube"), None, tmp_path).directory is None
+    assert run_details.log(None, 5).num_entries == 0

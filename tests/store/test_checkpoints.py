@@ -66,6 +66,8 @@ def test_file_name_and_pruning(store: CheckpointStore) -> None:
         "checkpoint-00000080.safetensors",
     ]
     assert store.load_latest().meta == {"step_twice": 160}
+    (link := store.directory / "best").symlink_to(store.path(60))
+    assert read_checkpoint(link).step == 60
 
 
 def test_any_flipped_bit_is_found(store: CheckpointStore) -> None:

@@ -96,7 +96,7 @@ def test_it_reads_what_a_run_told(store):
     writer = store.writer("cube")
     writer.status(told)
     writer.metrics(a_record(1, nan=float("nan")))
-    writer.goals(a_grid(1))
+    writer.goals(a_grid(0))  # before the first env step
     writer.goals(a_grid(2))
     writer.close()
     assert store.reader.run("cube") == told

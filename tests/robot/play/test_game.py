@@ -51,9 +51,10 @@ def test_another_goal_comes_when_he_is_there(game):
 def test_weights_that_are_set_drive_the_primitives(game, champion):
     go(game, 3)
     gate = champion.primitives.gate(np.concatenate((game.worlds.positions()[0], game.goal)).astype(np.float32))
+    start = game.state.copy()
     game.set_mode("primitives")
     np.testing.assert_allclose(game.weights, gate, rtol=1e-5)  # nothing changes until somebody sets one
-    start = game.state.copy()
+    np.testing.assert_array_equal(game.state, start)
     ends = []
     for action in np.eye(champion.primitives.num_primitives, dtype=np.float32)[:2] * 2 - 1:
         game.worlds.restore(start[None])
