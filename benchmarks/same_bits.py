@@ -6,7 +6,7 @@ The trainings run on this machine with this Python, one after the other, on one 
 plain values of the last checkpoint, the goals, and all metrics but ``time/*``. The exit code is 1 if anything differs
 or a training fails. To see that it finds a difference, change one number of this checkout:
 
-    sed -i 's/^DECAY = 0.95$/DECAY = 0.951/' service/generator/difficulty.py
+    sed -i 's/^MEMORY_TRIES = 30.0$/MEMORY_TRIES = 31.0/' service/generator/difficulty.py
     python -m benchmarks.same_bits --only self-play
 
 ``ROWS`` says what is run, by commands that both commits take. What 4dacdca learned was compared by this program of

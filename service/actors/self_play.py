@@ -21,6 +21,7 @@ from service.base.types import Arrays, BoolArray, FloatArray, IntArray, Metrics,
 from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, bob_observation
+from service.generator.bins import GoalCells
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import GoalRecords
 from service.generator.ring import Rows
@@ -90,6 +91,9 @@ class SelfPlay:
         self.incarnation = incarnation
         self._actor, self._sequence = actor, 0
         self._round_index: IntArray = np.zeros(config.game.num_worlds, dtype=np.int64)
+        self.cells = GoalCells(config.world, config.generator.cell_size_m)
+        self.reached: IntArray = np.zeros(len(self.cells), dtype=np.int64)
+        """(cells,) steps of the last round after which an object was there."""
         self.block_grippers(0.0)
         self.worlds.reset(rng)
 
@@ -125,6 +129,7 @@ class SelfPlay:
             observe: records the round, Alice's turn and then Bob's; it changes nothing in the rollout.
         """
         game, worlds = self.config.game, self.worlds
+        self.reached = np.zeros(len(self.cells), dtype=np.int64)
         start_state, start_position = worlds.states.copy(), worlds.object_position.copy()
         play_alice = self._play_alice if game.alice_plays else self._leave_alice_out
         alice, contacts, diverged = play_alice(players, plan, observe)
@@ -202,6 +207,7 @@ class SelfPlay:
             if observe:
                 observe(worlds.states)
             contacts |= worlds.contacts()
+            self._count_reached(all_worlds[~diverged])
         turns.value_observation[:] = turns.observation
         turns.final_value_observation[:] = worlds.full(1.0)
         turns.active[:num_steps] = True
@@ -250,6 +256,7 @@ class SelfPlay:
             count_work()
             if observe:
                 observe(worlds.states)
+            self._count_reached(playing[~diverged[playing]])
             reached = np.linalg.norm(worlds.object_position - choice.goal, axis=1) <= reach_m
             # Reaching the goal earns the reward and leaving it takes the reward back; ``solved`` is the step before.
             turns.reward[step, playing] = game.bob_success_reward * (reached.astype(np.float32) - solved)[playing]
@@ -260,6 +267,10 @@ class SelfPlay:
             playing = playing[~(over | diverged)[playing]]
         turns.final_value_observation[:] = worlds.bob_value(choice.goal)
         return turns, solved, diverged
+
+    def _count_reached(self, worlds: IntArray) -> None:
+        position = self.worlds.object_position[worlds]
+        self.reached += self.cells.count(position[in_workspace(position, self.config.world.workspace)])
 
     def _reward_alice(
         self, alice: Turns, verdict: VerdictArray, tried: BoolArray, solved: BoolArray, novelty: StateArray

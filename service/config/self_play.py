@@ -94,11 +94,12 @@ class GeneratorConfig(FrozenModel):
     )
     opponent_pool_size: int = Field(5, ge=1)
     opponent_interval: int = Field(10, ge=1, description="iterations between two snapshots of the players")
-    goal_source: Literal["alice", "uniform", "table", "learnable"] = Field(
+    goal_source: Literal["alice", "reached", "uniform", "table", "learnable"] = Field(
         "alice",
         description="of the goals that Bob plays besides those that Alice has just proposed. alice: her earlier ones. "
-        "Controls: uniform, drawn as those of an evaluation; table, anywhere on it; learnable, uniform goals weighted "
-        "by p (1 - p) of their cells (SFL, Rutherford et al. 2024)",
+        "reached: new ones in cells to which either player has brought the object in a game, and in cells beside "
+        "these, weighted by p (1 - p) of their cells. Controls: uniform, drawn as those of an evaluation; table, "
+        "anywhere on it; learnable, uniform goals weighted by p (1 - p) (SFL, Rutherford et al. 2024)",
     )
     replay_fraction: float = Field(
         0.0,
@@ -242,6 +243,13 @@ class ABCConfig(CloningConfig):
         description="also clone steps of Bob's failed turns, relabelled with where the object ended (Ghosh et al. "
         "2021); no more than there are of Alice's",
     )
+    mean_only_min_success: float = Field(
+        1.0,
+        ge=0.0,
+        le=1.0,
+        description="clone the mean only in updates in which Bob solved more than this share of his turns: by then he "
+        "needs no noise to explore, and cloned noise outweighs what his own turns say of it",
+    )
 
 
 class LearnerConfig(FrozenModel):
@@ -299,7 +307,10 @@ class SelfPlayConfig(Config):
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
-        if not self.game.alice_plays and (self.generator.goal_source == "alice" or not self.generator.replay_invalid):
+        generator = self.generator
+        if not self.game.alice_plays and (
+            generator.goal_source in ("alice", "reached") or not generator.replay_invalid
+        ):
             raise ValueError(
                 "without Alice there are no goals: set generator.goal_source to uniform, table or learnable, and "
                 "generator.replay_invalid=true, or game.alice_plays=true"

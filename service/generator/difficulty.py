@@ -7,11 +7,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from service.base.tensors import join_parts, split_parts
-from service.base.types import Array, Arrays, IntArray, StateArray
+from service.base.types import Array, Arrays, BoolArray, IntArray, StateArray
 from service.generator.bins import GoalCells
 
-DECAY = 0.95
-"""Weight that a try keeps from one record to the next: half after 13.5 iterations, so the rates follow Bob."""
+MEMORY_TRIES = 30.0
+"""Tries that a rate remembers: each later try of the same bin takes one part in so many of a try's weight, whatever the
+number of worlds."""
 PROPOSAL_DECAY = 0.99
 """Weight that a proposal keeps from one record to the next: what was not proposed for long is new again."""
 PRIOR_TRIES = 2.0
@@ -30,9 +31,14 @@ class SuccessCounts:
         """(B,) tries ever, not decayed."""
 
     def record(self, tries: IntArray, successes: IntArray) -> None:
-        """Age all counts by one iteration, then add its (B,) tries and (B,) successes."""
-        self.tries = DECAY * self.tries + tries
-        self.successes = DECAY * self.successes + successes
+        """Add (B,) tries and (B,) successes, which take weight from the earlier ones of their bins.
+
+        The successes count as spread evenly over the tries, so it does not matter in how many parts these come.
+        """
+        kept = (1.0 - 1.0 / MEMORY_TRIES) ** tries
+        added = (1.0 - kept) * MEMORY_TRIES  # the sum of the weights of so many tries
+        self.tries = kept * self.tries + added
+        self.successes = kept * self.successes + added * successes / np.maximum(tries, 1)
         self.num_tries += tries
 
     def success_rate(self) -> StateArray:
@@ -63,6 +69,8 @@ class DifficultyGrid:
         self.cells, self.counts = cells, SuccessCounts(len(cells))
         self.seen = np.zeros(len(cells), dtype=np.bool_)
         """(cells,) a valid goal was ever proposed there."""
+        self.reached = np.zeros(len(cells), dtype=np.bool_)
+        """(cells,) either player ever brought an object there in a game."""
         self.proposals = np.zeros(len(cells))
         """(cells,) decayed number of valid proposals, see ``PROPOSAL_DECAY``."""
 
@@ -71,11 +79,12 @@ class DifficultyGrid:
         """Cells in which a valid goal was ever proposed."""
         return int(np.count_nonzero(self.seen))
 
-    def record(self, proposed: IntArray, tries: IntArray, successes: IntArray) -> int:
+    def record(self, proposed: IntArray, reached: IntArray, tries: IntArray, successes: IntArray) -> int:
         """Age all counts by one iteration, then add what it brought.
 
         Args:
             proposed: (cells,) valid proposals, tried or not.
+            reached: (cells,) steps after which an object was there.
             tries: (cells,) of the present Bob.
             successes: (cells,) of these tries.
 
@@ -84,6 +93,7 @@ class DifficultyGrid:
         """
         before = self.num_cells_seen
         self.seen |= proposed > 0
+        self.reached |= reached > 0
         self.proposals = PROPOSAL_DECAY * self.proposals + proposed
         self.counts.record(tries, successes)
         return self.num_cells_seen - before
@@ -92,6 +102,17 @@ class DifficultyGrid:
         """(cells,) how rare proposals are: ``1 / sqrt(1 + n)`` of their decayed count (as in Bellemare et al. 2016)."""
         novelty: StateArray = 1.0 / np.sqrt(1.0 + self.proposals)
         return novelty
+
+    def near_reached(self) -> BoolArray:
+        """(cells,) whether a cell was reached, or shares a face with one that was."""
+        reached = self.reached.reshape(self.cells.shape)
+        near = reached.copy()
+        for axis in range(reached.ndim):
+            # Views in which this axis comes first: a change of ``towards`` is one of ``near``.
+            towards, beside = np.moveaxis(near, axis, 0), np.moveaxis(reached, axis, 0)
+            towards[1:] |= beside[:-1]
+            towards[:-1] |= beside[1:]
+        return near.ravel()
 
     def mean_success_rate(self) -> float:
         """Mean over all cells, 0 where there never was a goal: how much of the workspace Bob masters."""
@@ -104,10 +125,11 @@ class DifficultyGrid:
 
     def state(self) -> Arrays:
         """All counts, copied."""
-        own = {"seen": self.seen.copy(), "proposals": self.proposals.copy()}
+        own = {"seen": self.seen.copy(), "proposals": self.proposals.copy(), "reached": self.reached.copy()}
         return own | join_parts({"cells": self.counts.state()})
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Take over what ``state`` gave."""
         self.seen, self.proposals = np.array(state["seen"]), np.array(state["proposals"])
+        self.reached = np.array(state["reached"])
         self.counts.load_state(split_parts(state)["cells"])

@@ -104,6 +104,7 @@ class TaskGenerator:
             novelty=self.grid.novelty() * (1.0 - coverage),
             success_rate=np.array(self.grid.mean_success_rate()),
             coverage=np.array(coverage),
+            near_reached=self.grid.near_reached(),
         )
 
     def _replay_share(self, goal: StateArray) -> StateArray:
@@ -128,7 +129,7 @@ class TaskGenerator:
             ``alice/*``, ``bob/*`` and ``generator/*`` metrics; a rate over no cases is left out.
         """
         self.starts.add(None, **summary.starts)
-        num_new_cells = self.grid.record(summary.proposed, summary.tries, summary.successes)
+        num_new_cells = self.grid.record(summary.proposed, summary.reached, summary.tries, summary.successes)
         self.from_reset.record(summary.reset_tries, summary.reset_successes)
         cell = self.cells.index(summary.goals["goal"]) if self._config.generator.replay_over_cells else None
         self.buffer.add(cell, **summary.goals)
@@ -138,6 +139,7 @@ class TaskGenerator:
             **means(summary.metrics),
             "alice/goal_height_p90_m": height_percentile(summary.heights, 90.0),
             "generator/num_cells_seen": float(self.grid.num_cells_seen),
+            "generator/num_cells_reached": float(np.count_nonzero(self.grid.reached)),
             "generator/new_cells": float(num_new_cells),
             "generator/iterations_without_new_cell": float(self._stop.num_iterations_without_new_cell),
             "generator/buffer_size": float(len(self.buffer)),

@@ -24,7 +24,7 @@ NUM_HEIGHT_STEPS = 801
 """Up to 0.8 m, the highest workspace there may be."""
 Sums = dict[str, tuple[int, float]]
 """Number of cases and the sum over them, by metric: those of several rounds add up."""
-_COUNTS = ("proposed", "tries", "successes", "reset_tries", "reset_successes", "heights")
+_COUNTS = ("proposed", "reached", "tries", "successes", "reset_tries", "reset_successes", "heights")
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +152,8 @@ class GoalSummary:
 
     proposed: IntArray
     """(cells,) valid proposals, a past Alice's included."""
+    reached: IntArray
+    """(cells,) steps after which an object was there, whoever played."""
     tries: IntArray
     """(cells,) tries of the current Bob, but for replays from the start of a game."""
     successes: IntArray
@@ -175,6 +177,7 @@ class GoalSummary:
 def summarize(
     records: GoalRecords,
     starts: Rows,
+    reached: IntArray,
     cells: GoalCells,
     tasks: TaskBins,
     *,
@@ -190,6 +193,7 @@ def summarize(
     Args:
         records: of the round.
         starts: of the games that began with it.
+        reached: (cells,) steps of the round after which an object was there.
         cells: of goals.
         tasks: bins of tasks from resets.
         max_goals: of more new goals for the buffer, so many are drawn at random.
@@ -207,6 +211,7 @@ def summarize(
     began = _some(np.arange(len(starts["start_position"])), max_starts, rng)
     return GoalSummary(
         proposed=cells.count(records.proposal[records.verdict == Verdict.VALID]),
+        reached=reached,
         tries=cells.count(records.goal[as_proposed]),
         successes=cells.count(records.goal[as_proposed & records.solved]),
         reset_tries=np.bincount(bins, minlength=len(tasks)),

@@ -25,7 +25,7 @@ NUM_DRAWN = 1024
 """Goals drawn in a round for another ``goal_source`` than Alice, of which those that are played are chosen."""
 MIN_REPLAY_GOALS = 64
 """Goals the buffer must hold before any is replayed: fewer would be played over and over."""
-_ARRAYS = ("share", "cell_learnability", "reset_learnability", "novelty", "success_rate", "coverage")
+_ARRAYS = ("share", "cell_learnability", "reset_learnability", "novelty", "success_rate", "coverage", "near_reached")
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +74,8 @@ class GeneratorSnapshot:
     """() mean over all cells, 0 where no goal was ever proposed."""
     coverage: StateArray
     """() share of the cells in which a goal was ever proposed."""
+    near_reached: BoolArray
+    """(cells,) an object was brought there in a game, or to a cell beside it."""
 
     def choose_goals(
         self,
@@ -101,15 +103,17 @@ class GeneratorSnapshot:
             rng: source of the choice.
         """
         valid: BoolArray = verdict == Verdict.VALID
-        replayed = self._choose_replayed(valid, plan.bob_past, rng)
+        replayed, goals = self._choose_replayed(valid, plan.bob_past, rng), None
+        if replayed.any():
+            own = self.config.generator.goal_source == "alice"
+            goals = self._earlier_goals() if own else self._drawn_goals(start_state, start_position, rng)
+            replayed &= goals[1].any()
         starts = start_state.copy(), start_position.copy()
         from_reset = (round_index == 0) & ~replayed
         novelty = np.zeros(len(proposal))
         novelty[valid] = self.novelty[self.cells.index(proposal[valid])]
         choice = GoalChoice(proposal.copy(), *starts, replayed, from_reset, valid | replayed, novelty)
-        if replayed.any():
-            own = self.config.generator.goal_source == "alice"
-            goals = self._earlier_goals() if own else self._drawn_goals(start_state, start_position, rng)
+        if goals is not None and replayed.any():
             self._replay(choice, np.flatnonzero(replayed), *goals, rng)
         return choice
 
@@ -154,8 +158,9 @@ class GeneratorSnapshot:
             "start_state": start_state[rows],
             "start_position": start_position[rows],
         }
-        weight = self._weight(self.cell_learnability, self.cells.index(tasks["goal"])) * self._is_task(**tasks)
-        return tasks, weight, np.ones(NUM_DRAWN)
+        cell = self.cells.index(tasks["goal"])
+        share = self.near_reached[cell].astype(np.float64) if source == "reached" else np.ones(NUM_DRAWN)
+        return tasks, self._weight(self.cell_learnability, cell) * self._is_task(**tasks) * share, share
 
     def _replay(
         self,
@@ -188,7 +193,7 @@ class GeneratorSnapshot:
 
     def _weight(self, learnability: StateArray, bins: IntArray) -> StateArray:
         """(M,) weights of goals in (M,) bins: what Bob can learn there, or all alike where the source asks for that."""
-        if self.config.generator.goal_source in ("alice", "learnable"):
+        if self.config.generator.goal_source in ("alice", "reached", "learnable"):
             return learnability[bins] + LEARNABILITY_FLOOR
         return np.ones(len(bins))
 

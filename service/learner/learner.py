@@ -202,7 +202,10 @@ class Learner:
         demonstrations = self._to_clone(DEMONSTRATIONS, [each.demonstrations for each in rollouts])
         metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + mirrors))
         learns = self.version >= config.bob.value_first_updates
-        updated = ppo.update(bob, samples, demonstrations, config.abc, self._rng, policy_learns=learns)
+        how = config.abc
+        if solved_share(rollouts) > how.mean_only_min_success:
+            how = how.model_copy(update={"mean_only": True})
+        updated = ppo.update(bob, samples, demonstrations, how, self._rng, policy_learns=learns)
         metrics |= _prefixed("bob", updated)
         rows = samples if samples is not None else demonstrations
         if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):
@@ -226,6 +229,13 @@ def paid_well(turns: Turns, min_reward: float) -> Demonstrations:
     """The steps of the turns that ``learn`` and were paid at least ``min_reward``."""
     chosen = turns.active & (turns.learn & (turns.reward.sum(axis=0) >= min_reward))
     return Demonstrations(turns.observation[chosen], turns.action[chosen])
+
+
+def solved_share(rollouts: Sequence[Rollout]) -> float:
+    """Share of the current Bob's turns that he solved, whatever their goals; 0 where there were none."""
+    tried = [each.records.played & ~each.records.bob_past for each in rollouts]
+    solved = np.concatenate([each.records.solved[these] for each, these in zip(rollouts, tried, strict=True)])
+    return float(solved.mean()) if len(solved) else 0.0
 
 
 def _num(rows: Samples | DemonstrationRows | None) -> int:

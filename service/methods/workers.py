@@ -20,7 +20,7 @@ from service.base.types import Metrics
 from service.config.self_play import SelfPlayConfig
 from service.envs.sampling import GoalKind
 from service.envs.scene import build_layout
-from service.generator.bins import GoalCells, TaskBins
+from service.generator.bins import TaskBins
 from service.generator.generator import NUM_STARTS, TaskGenerator
 from service.generator.opponents import Opponents
 from service.generator.records import GoalSummary, join_summaries, summarize
@@ -63,7 +63,6 @@ class RolloutWorker:
         source = config.seed if (actor, incarnation) == (0, 0) else [config.seed, actor, incarnation]
         self.rng = np.random.default_rng(source)
         self.game = SelfPlay(config, self.rng, actor=actor, incarnation=incarnation, num_threads=num_threads)
-        self._cells = GoalCells(config.world, config.generator.cell_size_m)
         self._tasks = TaskBins(config, self.game.worlds.layout)
         self._opponents_version: int | None = None
         self._past: list[tuple[StochasticPolicy, StochasticPolicy]] = []
@@ -92,7 +91,8 @@ class RolloutWorker:
         goals = summarize(
             rollout.records,
             starts,
-            self._cells,
+            self.game.reached,
+            self.game.cells,
             self._tasks,
             max_goals=-(-config.replay_buffer_size // num_rounds),
             max_starts=-(-NUM_STARTS // num_rounds),

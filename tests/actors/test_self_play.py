@@ -444,6 +444,19 @@ def test_shapes_and_types(rollout):
         assert turns.active.dtype == turns.terminated.dtype == turns.learn.dtype == np.bool_
 
 
+def test_cells_that_an_object_reached_are_counted_whoever_plays():
+    """By Alice on the first two worlds, by Bob on the first, whose goal is far; outside of the workspace: nowhere."""
+    game = make_game(make_config(3), [IN_FRONT, AT_REST, LEAVES])
+    assert not game.reached.any()
+    rollout = play(game, Pusher(), choose_goals=given((-0.1, -0.1, 0.025)))
+    by_both = game.reached.copy()
+    assert by_both[game.cells.index(rollout.records.proposal[:1])] > 0
+    assert by_both[game.cells.index(np.array([AT_REST.position]))] >= 9 + 7
+    assert by_both.sum() < 3 * (9 + 7)  # LEAVES is outside for a while
+    play(game, choose_goals=given((-0.1, -0.1, 0.025)))
+    assert not np.array_equal(game.reached, by_both)  # of the last round only
+
+
 def test_ids_increase_and_say_who_played():
     game = make_game(make_config(1), actor=4, incarnation=2)
     assert [play(game).id for _ in range(3)] == [(4, 2, 0), (4, 2, 1), (4, 2, 2)]

@@ -124,6 +124,11 @@ def test_overrides_beat_the_file_and_the_last_one_wins(tmp_path):
         ("world.object={shape: mesh, mesh: {pieces: [a.stl], scale: 0}}", ["world.object.mesh.scale = 0"]),
         ("game=3", ["game = 3"]),
         ("game.bob_margin_m=0.05", ["game: bob_margin_m 0.05 must be less than success_distance_m 0.05"]),
+        ("generator.goal_source=hers", ["generator.goal_source = 'hers'", "'alice', 'reached', 'uniform'"]),
+        (
+            "learner.abc.mean_only_min_success=1.5",
+            ["learner.abc.mean_only_min_success = 1.5", "less than or equal to 1"],
+        ),
         ("world.object={shape: cone, size_m: [0.05]}", ["world.object.shape = 'cone'"]),
         ("world.object={shape: cylinder, size_m: [0.05]}", ["size_m of a cylinder has 2 numbers", "height; got 1"]),
         ("world.object={shape: capsule, size_m: [0.05, 0.04]}", ["length 0.04 must exceed its diameter"]),
@@ -148,6 +153,17 @@ def test_a_mistake_is_one_line_that_names_it(override, said):
     text = message(overrides=["seed=1", override])
     for words in said:
         assert words in text
+
+
+@pytest.mark.parametrize(("source", "replay_invalid"), [("alice", True), ("reached", True), ("uniform", False)])
+def test_without_alice_goals_come_from_elsewhere(source, replay_invalid):
+    given = [
+        "game.alice_plays=false",
+        f"generator={{goal_source: {source}, replay_invalid: {str(replay_invalid).lower()}}}",
+    ]
+    assert "without Alice there are no goals: set generator.goal_source to uniform, table or" in message(
+        overrides=given
+    )
 
 
 def test_the_file_is_named_in_its_errors(tmp_path):

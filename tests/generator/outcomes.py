@@ -11,6 +11,7 @@ from service.generator.bins import GoalCells, TaskBins
 from service.generator.generator import TaskGenerator
 from service.generator.records import GoalRecords, GoalSummary, summarize
 from service.generator.ring import Rows
+from service.generator.validity import Verdict
 
 STATE_SIZE = 4
 
@@ -48,10 +49,14 @@ def starts_of(*states: list[float]) -> Rows:
 def summary_of(
     records: GoalRecords, cells: GoalCells, tasks: TaskBins, starts: Rows | None = None, **limits: int
 ) -> GoalSummary:
-    """Summary of a round in which no game began, unless ``starts`` are given; nothing is left out without limits."""
+    """Summary of a round in which no game began, unless ``starts`` are given; nothing is left out without limits.
+
+    The object was nowhere but at its goals.
+    """
     none = {"start_state": np.zeros((0, records.start_state.shape[1])), "start_position": np.zeros((0, 3))}
     most = {"max_goals": 10**6, "max_starts": 10**6} | limits
-    return summarize(records, starts or none, cells, tasks, rng=np.random.default_rng(0), **most)
+    reached = cells.count(records.proposal[records.verdict == Verdict.VALID])
+    return summarize(records, starts or none, reached, cells, tasks, rng=np.random.default_rng(0), **most)
 
 
 def record(generator: TaskGenerator, records: GoalRecords, starts: Rows | None = None) -> Metrics:

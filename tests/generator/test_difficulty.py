@@ -7,7 +7,7 @@ import pytest
 
 from service.config import WorkspaceConfig, WorldConfig
 from service.generator.bins import NUM_DISTANCE_BINS, NUM_TASK_BINS, GoalCells, distance_bins, height_bins, in_air
-from service.generator.difficulty import DECAY, PROPOSAL_DECAY, DifficultyGrid, SuccessCounts
+from service.generator.difficulty import MEMORY_TRIES, PROPOSAL_DECAY, DifficultyGrid, SuccessCounts
 from service.methods.method import goal_grid
 
 WORLD = WorldConfig(workspace=WorkspaceConfig(center_x_m=0.1, center_y_m=0.0))
@@ -21,19 +21,38 @@ def record(grid: DifficultyGrid, goals: list[tuple[float, ...]], solved: list[bo
     """Valid proposals that were all tried."""
     tried = np.array(goals, dtype=np.float64).reshape(-1, 3)
     proposed = grid.cells.count(tried)
-    return grid.record(proposed, proposed, grid.cells.count(tried[np.array(solved, dtype=np.bool_)]))
+    return grid.record(proposed, proposed, proposed, grid.cells.count(tried[np.array(solved, dtype=np.bool_)]))
 
 
 def test_counts_by_hand() -> None:
     counts = SuccessCounts(3)
-    counts.record(np.array([3, 1, 0]), np.array([2, 0, 0]))
-    # Bin 0: (2 + 1) / (3 + 2); bin 1: (0 + 1) / (1 + 2); bin 2 untried: the prior's mean.
-    np.testing.assert_allclose(counts.success_rate(), [3 / 5, 1 / 3, 1 / 2], rtol=1e-15)
-    np.testing.assert_allclose(counts.learnability(), [6 / 25, 2 / 9, 1 / 4], rtol=1e-15)
+    counts.record(np.array([2, 1, 0]), np.array([1, 0, 0]))
+    keep = 1.0 - 1.0 / MEMORY_TRIES
+    # Bin 0: two tries, of which the second counts 1; bin 1: one; bin 2 untried: the prior's mean.
+    tries = 1.0 + keep
+    np.testing.assert_allclose(counts.tries, [tries, 1.0, 0.0], rtol=1e-12)
+    rates = np.array([(tries / 2 + 1) / (tries + 2), 1 / 3, 1 / 2])
+    np.testing.assert_allclose(counts.success_rate(), rates, rtol=1e-12)
+    np.testing.assert_allclose(counts.learnability(), rates * (1 - rates), rtol=1e-12)
     counts.record(np.array([1, 0, 0]), np.array([0, 0, 0]))
-    np.testing.assert_allclose(counts.tries, [3 * DECAY + 1, DECAY, 0.0], rtol=1e-15)
-    np.testing.assert_allclose(counts.successes, [2 * DECAY, 0.0, 0.0], rtol=1e-15)
-    assert counts.num_tries.tolist() == [4, 1, 0]
+    np.testing.assert_allclose(counts.tries, [1.0 + keep * tries, 1.0, 0.0], rtol=1e-12)
+    np.testing.assert_allclose(counts.successes, [keep * tries / 2, 0.0, 0.0], rtol=1e-12)
+    assert counts.num_tries.tolist() == [3, 1, 0]
+
+
+def test_rates_do_not_depend_on_the_number_of_worlds() -> None:
+    """The same tries, of which one in four succeeds, from 40 iterations of few worlds or 10 of four times as many."""
+    few, many = SuccessCounts(1), SuccessCounts(1)
+    for iteration in range(40):
+        few.record(np.array([4]), np.array([1]))
+        if iteration % 4 == 3:
+            many.record(np.array([16]), np.array([4]))
+    np.testing.assert_allclose(many.success_rate(), few.success_rate(), rtol=1e-12)
+    assert few.tries[0] == pytest.approx(MEMORY_TRIES, rel=0.01)
+    np.testing.assert_allclose(few.success_rate(), (MEMORY_TRIES / 4 + 1) / (MEMORY_TRIES + 2), rtol=0.01)
+    for _ in range(2):  # after as many tries as are remembered the new rate rules
+        few.record(np.array([30]), np.array([30]))
+    assert few.success_rate()[0] > 0.8
 
 
 @pytest.mark.parametrize(
@@ -73,19 +92,36 @@ def test_the_grid_of_what_is_shown() -> None:
 def test_grid_rates_by_hand() -> None:
     grid = make()
     easy, hard, untried = (0.1, 0.1, 0.025), (0.1, -0.1, 0.2), (0.2, 0.0, 0.3)
-    record(grid, [easy, easy, easy, hard], [True, True, True, False])
+    record(grid, [easy, hard], [True, False])
     goals = np.array([easy, hard, untried])
-    np.testing.assert_allclose(grid.counts.success_rate()[grid.cells.index(goals)], [4 / 5, 1 / 3, 1 / 2], rtol=1e-15)
+    np.testing.assert_allclose(grid.counts.success_rate()[grid.cells.index(goals)], [2 / 3, 1 / 3, 1 / 2], rtol=1e-12)
     learnability = grid.counts.learnability()[grid.cells.index(goals)]
-    np.testing.assert_allclose(learnability, [4 / 25, 2 / 9, 1 / 4], rtol=1e-15)
-    np.testing.assert_allclose(grid.mean_learnability(), (4 / 25 + 2 / 9) / 2, rtol=1e-15)
-    np.testing.assert_allclose(grid.mean_success_rate(), (4 / 5 + 1 / 3) / len(grid.cells), rtol=1e-15)
+    np.testing.assert_allclose(learnability, [2 / 9, 2 / 9, 1 / 4], rtol=1e-12)
+    np.testing.assert_allclose(grid.mean_learnability(), 2 / 9, rtol=1e-12)
+    np.testing.assert_allclose(grid.mean_success_rate(), (2 / 3 + 1 / 3) / len(grid.cells), rtol=1e-12)
     assert grid.num_cells_seen == 2
     tries = grid.cells.count(np.array([untried]))  # a goal that nobody proposed
-    grid.record(np.zeros_like(tries), tries, tries)
+    grid.record(np.zeros_like(tries), np.zeros_like(tries), tries, tries)
     assert grid.num_cells_seen == 2
-    rates = [(3 * 0.95 + 1) / (3 * 0.95 + 2), 1 / (0.95 + 2), 2 / 3]
-    np.testing.assert_allclose(grid.mean_success_rate(), sum(rates) / len(grid.cells), rtol=1e-12)
+    np.testing.assert_allclose(grid.mean_success_rate(), (2 / 3 + 1 / 3 + 2 / 3) / len(grid.cells), rtol=1e-12)
+
+
+def test_cells_near_those_that_were_reached() -> None:
+    """A corner has three neighbours that share a face, a cell in the middle six; what was reached stays so."""
+    grid = make()
+    none = np.zeros(len(grid.cells), dtype=np.int64)
+    assert not grid.near_reached().any()
+    corner, middle = none.copy(), none.copy()
+    corner[0], middle[171] = 5, 1  # cells (0, 0, 0) and (3, 3, 3) of 7 x 7 x 7
+    grid.record(none, corner, none, none)
+    assert np.flatnonzero(grid.near_reached()).tolist() == [0, 1, 7, 49]
+    grid.record(none, middle, none, none)
+    around = [171 - 49, 171 - 7, 170, 171, 172, 171 + 7, 171 + 49]
+    assert np.flatnonzero(grid.near_reached()).tolist() == [0, 1, 7, 49, *around]
+    assert grid.num_cells_seen == 0  # no goal was proposed in any
+    again = make()
+    again.load_state(grid.state())
+    assert np.array_equal(again.reached, grid.reached)
 
 
 def test_a_new_cell_is_counted_once_tried_or_not() -> None:
@@ -93,9 +129,9 @@ def test_a_new_cell_is_counted_once_tried_or_not() -> None:
     assert np.isnan(grid.mean_learnability())
     goals = np.array([[0.1, 0.1, 0.02], [0.1, 0.1, 0.03], [0.1, -0.1, 0.02]])
     proposed, none = grid.cells.count(goals), np.zeros(len(grid.cells), dtype=np.int64)
-    assert grid.record(proposed, none, none) == 2
-    assert grid.record(proposed, none, none) == 0
-    assert grid.record(none, none, none) == 0
+    assert grid.record(proposed, none, none, none) == 2
+    assert grid.record(proposed, none, none, none) == 0
+    assert grid.record(none, none, none, none) == 0
     assert grid.num_cells_seen == 2
     assert not grid.counts.num_tries.any()
 
@@ -105,9 +141,9 @@ def test_novelty_by_hand() -> None:
     goals = np.array([[0.1, 0.1, 0.02]] * 3 + [[0.1, -0.1, 0.02]])
     often, once, never = grid.cells.index(np.array([goals[0], goals[3], (0.2, 0.0, 0.3)]))
     proposed, none = grid.cells.count(goals), np.zeros(len(grid.cells), dtype=np.int64)
-    grid.record(proposed, none, none)  # tried or not
+    grid.record(proposed, none, none, none)  # tried or not
     np.testing.assert_allclose(grid.novelty()[[often, once, never]], [1 / 2, 0.5**0.5, 1.0], rtol=1e-15)
-    grid.record(none, none, none)
+    grid.record(none, none, none, none)
     expected = 1.0 / (1.0 + PROPOSAL_DECAY * np.array([3.0, 1.0])) ** 0.5
     np.testing.assert_allclose(grid.novelty()[[often, once]], expected, rtol=1e-15)
 

@@ -12,6 +12,7 @@ import pytest
 from service.config import Config, parse_config
 from service.config.self_play import GeneratorConfig
 from service.envs.state_layout import StateLayout
+from service.generator.difficulty import MEMORY_TRIES
 from service.generator.generator import StopCriterion, TaskGenerator
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.ring import Rows
@@ -32,6 +33,11 @@ STOPPING = GeneratorConfig(novelty_window=4, stop_success_rate=0.95)
 
 def config(**generator: Any) -> Config:
     return parse_config({"generator": generator}, where="test")
+
+
+def remembered(num_tries: int) -> float:
+    """The weight of so many tries of a bin: each takes a part of that of those before it."""
+    return MEMORY_TRIES * (1.0 - (1.0 - 1.0 / MEMORY_TRIES) ** num_tries)
 
 
 def all_current(num: int) -> RoundPlan:
@@ -127,7 +133,8 @@ def test_replayed_goals_may_start_where_a_game_did() -> None:
     num_tries, num = MIN_REPLAY_GOALS, 2000
     first = choose(generator, [VALID] * num)
     # From their own starts the old goals were tried and failed; from a reset nothing is known, so 1/2.
-    own = 1 / (num_tries + 2) * (1 - 1 / (num_tries + 2)) + LEARNABILITY_FLOOR
+    rate = 1 / (remembered(num_tries) + 2)
+    own = rate * (1 - rate) + LEARNABILITY_FLOOR
     share = (0.25 + LEARNABILITY_FLOOR) / (0.25 + LEARNABILITY_FLOOR + own)
     assert first.from_reset.mean() == pytest.approx(share, abs=3 * np.sqrt(share * (1 - share) / num))
     assert (first.start_state[:, 0] == np.where(first.from_reset, 1.0, 7.0)).all()
@@ -185,7 +192,8 @@ def test_blocked_tasks_are_counted_apart() -> None:
     assert metrics["bob/success_rate"] == 0.75
     assert metrics["alice/valid_fraction_blocked"] == 1.0
     rates = np.unique(generator.from_reset.learnability())  # of no tries, of 10 failures, of 30 successes
-    expected = [p * (1 - p) for p in (1 / 32, 1 / 12, 1 / 2)]
+    rates_of = 1 / (remembered(30) + 2), 1 / (remembered(10) + 2), 1 / 2
+    expected = [p * (1 - p) for p in rates_of]
     assert rates == pytest.approx(expected)
 
 
@@ -223,13 +231,36 @@ def test_learnable_goals_are_drawn_by_learnability() -> None:
     """Bob always solves goals in the cells with x below -2.5 cm, 20 of 35 cm; of the others nothing is known."""
     cells = TaskGenerator(config(), FREE).cells.centers()
     solved = np.repeat(cells[cells[:, 0] < -0.025], 100, axis=0)
-    known = 101 / 102 * 1 / 102
+    known = (remembered(100) + 1) / (remembered(100) + 2) ** 2
     for source, (left, right) in {"uniform": (1.0, 1.0), "learnable": (known + 0.01, 0.25 + 0.01)}.items():
         generator = TaskGenerator(config(goal_source=source, replay_invalid=True), FREE)
         record(generator, make_records(solved, solved=np.ones(len(solved), dtype=np.bool_)))
         goal = choose(generator, [OUTSIDE] * 4000).goal
         share = 20 * left / (20 * left + 15 * right)
         assert np.mean(goal[:, 0] < -0.025) == pytest.approx(share, abs=0.04), source
+
+
+def test_reached_goals_are_drawn_where_an_object_was_and_beside() -> None:
+    generator = TaskGenerator(config(goal_source="reached", replay_invalid=True, replay_from_reset=True), FREE)
+    assert not choose(generator, [OUTSIDE] * 40).replayed.any()  # nothing was reached yet
+    record(generator, make_records([(0.1, 0.1, 0.2)]), ONE_GAME)
+    choice = choose(generator, [OUTSIDE] * 400)
+    assert choice.replayed.all()
+    goals = np.concatenate([choose(generator, [OUTSIDE] * 400, seed=seed).goal for seed in range(20)])
+    drawn = np.unique(generator.cells.index(goals))
+    assert drawn.tolist() == np.flatnonzero(generator.grid.near_reached()).tolist()
+    assert len(drawn) == 6  # at the workspace's edge
+
+
+def test_reached_goals_are_drawn_by_learnability() -> None:
+    """Of six cells that are near what was reached Bob always solves the one in the middle."""
+    generator = TaskGenerator(config(goal_source="reached", replay_invalid=True), FREE)
+    middle = (0.1, 0.1, 0.2)
+    record(generator, make_records([middle] * 100, solved=np.ones(100, dtype=np.bool_)), ONE_GAME)
+    goals = np.concatenate([choose(generator, [OUTSIDE] * 400, seed=seed).goal for seed in range(20)])
+    known, unknown = (remembered(100) + 1) / (remembered(100) + 2) ** 2 + 0.01, 0.25 + 0.01
+    share = np.mean(generator.cells.index(goals) == generator.cells.index(np.array([middle])))
+    assert share == pytest.approx(known / (known + 5 * unknown), rel=0.3)
 
 
 def test_no_drawn_goal_in_the_air_where_the_gripper_is_blocked() -> None:
@@ -265,8 +296,8 @@ def test_replay_prefers_learnable_goals() -> None:
     goals = [solved_always] * 100 + [solved_half] * 100
     record(generator, make_records(goals, solved=[True] * 100 + [True, False] * 50))
     goal = choose(generator, [VALID] * 4000).goal
-    # p = 101/102 against 1/2, each with the floor of 0.01 on top of p (1 - p).
-    easy, hard = 101 / 102**2 + 0.01, 0.25 + 0.01
+    # Each with the floor of 0.01 on top of p (1 - p).
+    easy, hard = (remembered(100) + 1) / (remembered(100) + 2) ** 2 + 0.01, 0.25 + 0.01
     assert np.mean(goal[:, 0] > 0) == pytest.approx(easy / (easy + hard), abs=0.015)
 
 
@@ -306,8 +337,9 @@ def test_record_separates_who_learns_what() -> None:
     # The current Bob tried the first cell three times and the past Alice's once; the past Bob's try does not count.
     goals = np.array([(-0.2, 0.0, 0.02), (-0.1, 0.0, 0.02), (0.0, 0.1, 0.02), (0.1, 0.1, 0.02)])
     rates = generator.grid.counts.success_rate()[generator.cells.index(goals)]
-    np.testing.assert_allclose(rates, [2 / 5, 2 / 3, 1 / 2, 1 / 2])
-    expected = (6 / 25 + 2 / 9 + 1 / 4 + 1 / 4) / 4
+    tries = remembered(3)
+    np.testing.assert_allclose(rates, [(tries / 3 + 1) / (tries + 2), 2 / 3, 1 / 2, 1 / 2])
+    expected = float(np.mean([rate * (1 - rate) for rate in ((tries / 3 + 1) / (tries + 2), 1 / 3, 1 / 2, 1 / 2)]))
     assert metrics["generator/mean_learnability"] == pytest.approx(expected)
 
 

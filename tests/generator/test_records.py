@@ -277,5 +277,6 @@ def test_random_numbers_are_left_alone_where_nothing_is_left_out() -> None:
     records, starts = make_records([(0.1, 0.0, 0.025)] * 5), starts_of([1.0] * 4)
     for max_goals, untouched in ((5, True), (4, False)):
         rng, same = np.random.default_rng(3), np.random.default_rng(3)
-        summarize(records, starts, CELLS, TASKS, max_goals=max_goals, max_starts=1, rng=rng)
+        reached = CELLS.count(records.proposal)
+        summarize(records, starts, reached, CELLS, TASKS, max_goals=max_goals, max_starts=1, rng=rng)
         assert (rng.bit_generator.state == same.bit_generator.state) is untouched

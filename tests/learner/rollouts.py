@@ -12,9 +12,9 @@ import torch
 from service.actors.rollout import Demonstrations, Rollout, Turns
 from service.config import Config, parse_config
 from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL
-from service.generator.records import GoalRecords
 from service.learner.learner import Learner
 from service.learner.player import Player
+from tests.generator.outcomes import make_records
 
 DEVICE = torch.device(os.environ.get("TANDEM_TEST_DEVICE", "cpu"))
 """The device that learners of these tests learn on."""
@@ -97,6 +97,4 @@ def _normal(rng: np.random.Generator, scale: float, *shape: int) -> np.ndarray:
     return (scale * rng.standard_normal(shape)).astype(np.float32)
 
 
-_NO_RECORDS = GoalRecords(
-    **{name: np.zeros(0) for name in GoalRecords.__dataclass_fields__}  # the learner never reads them
-)
+_NO_RECORDS = make_records(np.zeros((0, 3)))

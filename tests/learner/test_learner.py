@@ -8,7 +8,8 @@ from safetensors.numpy import load, save
 from service.base.errors import ConfigError
 from service.envs.observations import ACTION, BOB
 from service.learner import ppo
-from service.learner.learner import Learner, _rng_from_array, _rng_to_array, paid_well, torch_device
+from service.learner.learner import Learner, _rng_from_array, _rng_to_array, paid_well, solved_share, torch_device
+from tests.generator.outcomes import make_records
 from tests.learner.rollouts import make_config, make_rollout, nobody_learns
 
 IMITATION = {"weight": 0.5, "num_iterations": 2, "min_reward": 0.5}
@@ -320,6 +321,29 @@ def test_the_weight_of_cloning_is_that_of_the_configuration():
         metrics = updated(Learner(make_config(abc={"weight": weight}, bob={"target_kl": 1.0})), 0)
         log_ratios.append(metrics["learner/demonstration_log_ratio"])
     assert log_ratios[1] > 1.5 * log_ratios[0] > 0.0
+
+
+def test_how_many_of_his_turns_bob_solved():
+    """Those of a past Bob, and those without a goal, are none of his."""
+    goals = np.zeros((5, 3))
+    first = make_records(goals, solved=[True, True, False, True, True], bob_past=[False] * 3 + [True] * 2)
+    second = make_records(goals[:2], solved=[False, True], played=[True, False])
+    learner = Learner(make_config())
+    rollouts = [replace(make_rollout(learner, 0), records=records) for records in (first, second)]
+    assert solved_share(rollouts) == 2 / 4
+    assert solved_share([make_rollout(learner, 0)]) == 0.0
+
+
+@pytest.mark.parametrize(("solved", "mean_only"), [([True, False], False), ([True, True, False], True)])
+def test_clones_leave_the_noise_alone_once_bob_solves_more_than_that(solved, mean_only):
+    records = make_records(np.zeros((len(solved), 3)), solved=solved)
+    learners = [
+        Learner(make_config(abc={"mean_only_min_success": 0.5})),
+        Learner(make_config(abc={"mean_only": mean_only})),
+    ]
+    for learner in learners:
+        updated(learner, 0, records=records)
+    assert_same_state(*learners)
 
 
 def test_a_broken_turn_leaves_the_player_as_it_was():
