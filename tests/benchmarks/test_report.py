@@ -117,7 +117,7 @@ def test_the_digest_that_a_page_calls_the_champion_is_the_bundled_ones():
     ((run, words),) = re.findall(r"`panda-cube@champion`, in the package, is version \d+, the run (\S+): (.*)", page)
     assert f"parameters `{digest[:12]}`" in words
     recorded = json.loads((DOCS / "results" / "runs" / f"{run}.json").read_text())
-    assert differences(recorded["config"]) == {}  # of today's recipe, as the page says
+    assert "generator.goal_source" in differences(recorded["config"])  # of an earlier recipe
     trial = json.loads((DOCS / "results" / "downstream" / "larger-asp-only-0.json").read_text())
     assert trial["primitives"]["digest"] == digest  # seed 0 of the table rests on it, as the page says
 
