@@ -1,4 +1,4 @@
-"""Mutation testing: change one thing in the code that learns, and see whether a test fails.
+"""Mutation testing: change one thing in the code, and see whether a test fails.
 
     pip install --target DIR cosmic-ray==8.7.0    # for this program alone: it brings packages along
     pip install --target COV --no-deps coverage==7.10.7 pytest-cov==7.0.0    # for the project's own tests

@@ -88,9 +88,9 @@ def robots_words(result: Result) -> str:
     """What was measured, and where."""
     return (
         "A hand-written policy picks a cube up, carries it into the air and holds it for 5 s, within 1 cm. Env steps "
-        "are of random actions with one thread. Self-play is the Panda's recipe unchanged, one seed; shares are means "
-        "over its last 200,000 env steps. The mesh is a frustum: its sides lean by 9 degrees, and a grip by hand loses "
-        f"it more often.{measured_on(result['machine'])}"
+        "are of random actions with one thread. Self-play is the Panda's recipe of that day, one seed; shares are "
+        "means over its last 200,000 env steps. The mesh is a frustum: its sides lean by 9 degrees, and a grip by hand "
+        f"loses it more often.{measured_on(result['machine'])}"
     )
 
 

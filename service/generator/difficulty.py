@@ -20,7 +20,7 @@ PRIOR_TRIES = 2.0
 
 
 class SuccessCounts:
-    """Exponentially decayed tries and successes of ``num_bins`` bins."""
+    """Tries and successes of ``num_bins`` bins; the later a try, the more it weighs."""
 
     def __init__(self, num_bins: int) -> None:
         self.tries = np.zeros(num_bins)
@@ -62,7 +62,7 @@ class SuccessCounts:
 class DifficultyGrid:
     """Bob's success over goal cells that cover the workspace.
 
-    All rates are decayed running ones (see ``DECAY``), one ``record`` being one iteration, so they follow Bob.
+    All rates remember the last tries (see ``MEMORY_TRIES``), so they follow Bob.
     """
 
     def __init__(self, cells: GoalCells) -> None:
@@ -80,7 +80,7 @@ class DifficultyGrid:
         return int(np.count_nonzero(self.seen))
 
     def record(self, proposed: IntArray, reached: IntArray, tries: IntArray, successes: IntArray) -> int:
-        """Age all counts by one iteration, then add what it brought.
+        """Add what an iteration brought, and age the proposals by it.
 
         Args:
             proposed: (cells,) valid proposals, tried or not.

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.measuring import write_json
 from service.config import load_config
 from service.envs.scene import build_model
 
@@ -43,8 +44,8 @@ def compiled(name: str) -> dict[str, list[float]]:
 
 @pytest.mark.parametrize("name", WORLDS)
 def test_it_is_the_world_that_was_trained_in(name: str) -> None:
-    recorded = json.loads(FILE.read_text(encoding="utf-8"))["recipe"]
-    recorded |= json.loads(FILE.read_text(encoding="utf-8"))[name]
+    worlds = json.loads(FILE.read_text(encoding="utf-8"))
+    recorded = worlds["recipe"] | worlds[name]
     for what, numbers in compiled(name).items():
         np.testing.assert_allclose(numbers, recorded[what], rtol=1e-7, atol=1e-9, err_msg=what)
 
@@ -55,8 +56,7 @@ def main() -> None:
     recipe = worlds["recipe"]
     for name in [*worlds][1:]:
         worlds[name] = {what: numbers for what, numbers in worlds[name].items() if numbers != recipe[what]}
-    FILE.parent.mkdir(exist_ok=True)
-    FILE.write_text(json.dumps(worlds, indent=0) + "\n", encoding="utf-8")
+    write_json(FILE, worlds)
 
 
 if __name__ == "__main__":
