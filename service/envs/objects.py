@@ -15,7 +15,7 @@ from service.envs.state_layout import OBSTACLE_PREFIX
 GRIPPER_BIT, OBJECT_BIT, TABLE_BIT, FLOOR_BIT = 1, 2, 4, 8
 """MuJoCo's contact types. Table and fixtures are touched by gripper and object, the object by the gripper. Obstacles
 are objects that are also touched by objects, and by the floor."""
-OBSTACLE_PRIORITY, _PAD_PRIORITY = 1, 2
+OBSTACLE_PRIORITY, _GRIPPER_PRIORITY = 1, 2
 """Where two touch, friction and stiffness are those of the one with more."""
 STIFF = {"solref": (0.01, 1.0), "solimp": (0.95, 0.99, 0.001, 0.5, 2.0)}
 """Contacts of objects and what they lie on. MuJoCo's default yields more the lighter the object: an arm leaning on the
@@ -30,12 +30,19 @@ _UPRIGHT = "upright"
 """Site whose z axis is up: forces on other sites have its directions."""
 
 
+def slide(geom: mujoco.MjsGeom) -> None:
+    """Let a geom of the gripper slide over what it touches, as metal does: it pushes a cube, but does not wedge it."""
+    geom.friction = (BODY_FRICTION, 0.005, 0.0001)
+    geom.solref, geom.solimp = STIFF["solref"], STIFF["solimp"]
+    geom.priority = _GRIPPER_PRIORITY
+
+
 def grip(geom: mujoco.MjsGeom, friction: float) -> None:
     """Let a geom of a finger hold what it touches."""
     geom.friction = (friction, 0.005, 0.0001)
     geom.condim = 4  # torsion, or a cube turns between the fingers
     geom.solref, geom.solimp = (0.01, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)
-    geom.priority = _PAD_PRIORITY  # these parameters, not a mixture with the object's
+    geom.priority = _GRIPPER_PRIORITY  # these parameters, not a mixture with the object's
 
 
 def add_finger_sensors(spec: mujoco.MjSpec, fingers: Iterable[str]) -> None:

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from service.config.robot import EffectorConfig, FingerConfig, RobotConfig
-from service.envs.objects import BODY_FRICTION, GRIPPER_BIT, grip
+from service.envs.objects import GRIPPER_BIT, grip, slide
 
 JOINT_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 JOINT_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
@@ -145,14 +145,15 @@ def _add_finger(
 
 
 def _collision(body: Any, name: str, radius: float, ends: tuple[tuple[float, ...], ...]) -> Any:
-    return body.add_geom(
+    geom = body.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
         size=(radius, 0, 0),
         fromto=[*ends[0], *ends[1]],
         contype=GRIPPER_BIT,
         conaffinity=0,
-        friction=(BODY_FRICTION, 0.005, 0.0001),
         mass=0.0,
         group=3,
     )
+    slide(geom)
+    return geom

@@ -17,7 +17,7 @@ from service.config.model_files import model_file
 from service.config.robot import Numbers, PadConfig, RobotConfig
 from service.envs import panda
 from service.envs.kinematics import Chain
-from service.envs.objects import BODY_FRICTION, GRIPPER_BIT, add_finger_sensors, grip
+from service.envs.objects import GRIPPER_BIT, add_finger_sensors, grip, slide
 
 _PREFIX, _HAND_PREFIX = "robot/", "hand/"
 """Begin the names of all that comes from a file, so that none is that of something in the scene; a hand's has both."""
@@ -248,7 +248,8 @@ def _let_touch(spec: mujoco.MjSpec, robot: RobotConfig, fingers: list[mujoco.Mjs
     others = touching + [finger.parent for finger in fingers]
     for geom in joined.from_iterable(body.geoms for body in others):
         if geom.id in solid:
-            geom.contype, geom.friction = GRIPPER_BIT, (BODY_FRICTION, 0.005, 0.0001)
+            geom.contype = GRIPPER_BIT
+            slide(geom)
     for finger, description in zip(fingers, robot.fingers, strict=True):
         own = [geom for geom in finger.find_all(mujoco.mjtObj.mjOBJ_GEOM) if geom.id in solid]
         for geom in [_add_pad(finger, pad) for pad in description.pads] or own:

@@ -131,7 +131,8 @@ def test_only_the_gripper_touches_and_nothing_of_a_scene_comes_along(pincher):
         model = worlds.model
         touching = {model.geom(index).name for index in range(model.ngeom) if model.geom_contype[index] == GRIPPER_BIT}
         assert touching == {"robot/fixed", "robot/moving"}
-        assert model.geom("robot/fixed").friction.tolist() == [0.3, 0.005, 0.0001]
+        fixed = model.geom("robot/fixed")
+        assert (fixed.friction.tolist(), fixed.solref[0], fixed.priority[0]) == ([0.3, 0.005, 0.0001], 0.01, 2)
         assert model.body("robot/base").pos.tolist() == [-0.36, 0.0, 0.0]
         assert (model.opt.timestep, model.opt.gravity[2]) == (0.002, 0.0)
         assert (model.nu, model.nkey, model.nlight, model.nsensor) == (7, 0, 0, 1)

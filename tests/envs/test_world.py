@@ -78,7 +78,7 @@ def test_rough_play_breaks_nothing(shape, physics, num_steps):
     assert extremes.within_bounds(), extremes
 
 
-def test_contacts_are_those_that_published_primitives_were_trained_with():
+def test_contacts_are_those_that_primitives_are_trained_with():
     ball = {"shape": "sphere", "size_m": (0.05,)}
     model = build_model(WorldConfig(fixture="box", obstacles=[ball], start_height_m=0.2))
     assert np.unique(model.geom_friction[:, 1:], axis=0).tolist() == [[0.005, 0.0001]]
@@ -89,7 +89,8 @@ def test_contacts_are_those_that_published_primitives_were_trained_with():
     assert (option.impratio, option.noslip_iterations, option.iterations, option.tolerance) == (1.0, 5, 50, 1e-8)
     expected = {  # sliding friction, time, least and most impedance, dimensions, priority, type, affinity
         "table": (1.0, 0.01, 0.95, 0.99, 3, 0, 4, 3),
-        "hand": (0.3, 0.02, 0.9, 0.95, 3, 0, 1, 0),
+        "hand": (0.3, 0.01, 0.95, 0.99, 3, 2, 1, 0),
+        "left_shaft": (0.3, 0.01, 0.95, 0.99, 3, 2, 1, 0),
         "left_pad_front": (1.0, 0.01, 0.9, 0.95, 4, 2, 1, 0),
         "object": (1.0, 0.01, 0.95, 0.99, 3, 0, 2, 1),
         "obstacle_1": (1.0, 0.01, 0.95, 0.99, 6, 1, 2, 11),
@@ -100,6 +101,26 @@ def test_contacts_are_those_that_published_primitives_were_trained_with():
         geom = model.geom(name)
         touching = (geom.condim[0], geom.priority[0], geom.contype[0], geom.conaffinity[0])
         assert (geom.friction[0], geom.solref[0], *geom.solimp[:2], *touching) == numbers, name
+
+
+def test_the_palm_slides_over_a_cube_and_does_not_sink_into_it():
+    """Of two geoms of one priority MuJoCo takes the larger friction, the cube's: the palm wedged it on the table."""
+    with WorldBatch(WorldConfig(**COARSE), 1) as worlds:
+        states = worlds.states.copy()
+        arm = worlds.robot.arm
+        states[:, 1:8] = arm.solve(arm.home[None], np.array([[0.0, 0.0, 0.03]]), num_iterations=60)
+        states[:, 10:13] = [0.0, 0.0, 0.025]
+        worlds.restore(states)
+        act(worlds, 0, 0, -1, OPEN, num_steps=5)
+        data = mujoco.MjData(worlds.model)
+        mujoco.mj_setState(
+            worlds.model, data, worlds.states[0, worlds.layout.physics], mujoco.mjtState.mjSTATE_FULLPHYSICS
+        )
+        mujoco.mj_forward(worlds.model, data)
+        pressed = {frozenset((int(contact.geom1), int(contact.geom2))): contact for contact in data.contact}
+        contact = pressed[frozenset((worlds.model.geom("hand").id, worlds.model.geom("object").id))]
+        assert contact.friction[0] == 0.3
+        assert -1.5e-3 < contact.dist < 0.0
 
 
 def test_no_action_no_motion():
