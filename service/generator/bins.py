@@ -80,7 +80,8 @@ class GoalCells:
 class TaskBins:
     """Bins of tasks, a task being a goal and a start, by what makes them hard for Bob.
 
-    They are the goal's height, its distance from the object's start and, where a run blocks some grippers, the gripper.
+    They are the goal's height, its distance from the object's start, and the gripper: it is free, or it holds the object
+    already, or, where a run blocks some grippers, it is blocked.
 
     Args:
         config: the run.
@@ -93,16 +94,19 @@ class TaskBins:
         self.some_blocked = config.game.blocked_gripper_fraction > 0.0
         self.obstacles = obstacle_columns(layout, len(config.world.obstacles))
         """Columns of a state that hold poses of obstacles."""
+        self._contacts = layout["contacts"]
         self._gripper_blocked = layout["gripper_blocked"]  # columns that say so; none where worlds have no such flag
 
     def __len__(self) -> int:
         """Number of bins."""
-        return NUM_TASK_BINS * (1 + self.some_blocked)
+        return NUM_TASK_BINS * (2 + self.some_blocked)
 
     def index(self, goals: StateArray, start_positions: StateArray, start_states: StateArray) -> IntArray:
         """(M,) bin of each task: (M, 3) goal, (M, 3) position of the object and (M, S) state at the start."""
         bins = height_bins(goals, self.rest_height_m) * NUM_DISTANCE_BINS + distance_bins(goals, start_positions)
-        return bins + self.blocked(start_states) * NUM_TASK_BINS
+        blocked = self.blocked(start_states)
+        held = ~blocked & (start_states[:, self._contacts] > 0.0).all(axis=1)
+        return bins + (held + 2 * blocked) * NUM_TASK_BINS
 
     def blocked(self, states: StateArray) -> BoolArray:
         """(M,) whether the gripper of (M, S) states is blocked; none is where states have no such flag."""

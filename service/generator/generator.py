@@ -34,7 +34,7 @@ class StopCriterion:
         """Iterations since the last new goal cell."""
 
     def record(self, num_new_cells: int, num_tried: int, num_solved: int) -> None:
-        """Add one iteration: new goal cells, and tries and successes of the current players' goals."""
+        """Add one iteration: new goal cells, and the present Bob's tries and successes, all of them."""
         self._window[self._num_iterations % len(self._window)] = num_tried, num_solved
         self._num_iterations += 1
         self.num_iterations_without_new_cell = 0 if num_new_cells else self.num_iterations_without_new_cell + 1
@@ -77,15 +77,14 @@ class TaskGenerator:
         """States right after a reset."""
         self.opponents = Opponents(0)
         """Past versions of both players."""
-        self.from_reset = SuccessCounts(len(self.tasks))
-        """Bob's success from resets, by the goal's height and distance; those with a blocked gripper apart. They are
-        harder than what starts where Alice left off."""
+        self.difficulty = SuccessCounts(len(self.tasks))
+        """Bob's success at tasks, by their bins."""
         self._stop = StopCriterion(config.generator)
         self._parts: dict[str, DifficultyGrid | Ring | SuccessCounts | StopCriterion] = {
             "grid": self.grid,
             "buffer": self.buffer,
             "starts": self.starts,
-            "from_reset": self.from_reset,
+            "difficulty": self.difficulty,
             "stop": self._stop,
         }
 
@@ -98,9 +97,8 @@ class TaskGenerator:
             tasks=self.tasks,
             buffer=buffer,
             share=self._replay_share(buffer["goal"]),
-            cell_learnability=self.grid.counts.learnability(),
             starts=self.starts.rows(),
-            reset_learnability=self.from_reset.learnability(),
+            learnability=self.difficulty.learnability(),
             novelty=self.grid.novelty() * (1.0 - coverage),
             success_rate=np.array(self.grid.mean_success_rate()),
             coverage=np.array(coverage),
@@ -130,11 +128,10 @@ class TaskGenerator:
         """
         self.starts.add(None, **summary.starts)
         num_new_cells = self.grid.record(summary.proposed, summary.reached, summary.tries, summary.successes)
-        self.from_reset.record(summary.reset_tries, summary.reset_successes)
+        self.difficulty.record(summary.task_tries, summary.task_successes)
         cell = self.cells.index(summary.goals["goal"]) if self._config.generator.replay_over_cells else None
         self.buffer.add(cell, **summary.goals)
-        num_tried, num_solved = summary.metrics["bob/success_rate"]  # of the current players' own goals
-        self._stop.record(num_new_cells, num_tried, int(num_solved))
+        self._stop.record(num_new_cells, int(summary.task_tries.sum()), int(summary.task_successes.sum()))
         metrics = {
             **means(summary.metrics),
             "alice/goal_height_p90_m": height_percentile(summary.heights, 90.0),

@@ -24,7 +24,7 @@ NUM_HEIGHT_STEPS = 801
 """Up to 0.8 m, the highest workspace there may be."""
 Sums = dict[str, tuple[int, float]]
 """Number of cases and the sum over them, by metric: those of several rounds add up."""
-_COUNTS = ("proposed", "reached", "tries", "successes", "reset_tries", "reset_successes", "heights")
+_COUNTS = ("proposed", "reached", "tries", "successes", "task_tries", "task_successes", "heights")
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,9 +158,9 @@ class GoalSummary:
     """(cells,) tries of the current Bob, but for replays from the start of a game."""
     successes: IntArray
     """(cells,) of these tries."""
-    reset_tries: IntArray
-    """(task bins,) tries of the current Bob from where a game starts."""
-    reset_successes: IntArray
+    task_tries: IntArray
+    """(task bins,) tries of the current Bob."""
+    task_successes: IntArray
     """(task bins,) of these tries."""
     metrics: Sums
     """``alice/*`` and ``bob/*`` metrics."""
@@ -195,15 +195,14 @@ def summarize(
         starts: of the games that began with it.
         reached: (cells,) steps of the round after which an object was there.
         cells: of goals.
-        tasks: bins of tasks from resets.
+        tasks: bins of tasks.
         max_goals: of more new goals for the buffer, so many are drawn at random.
         max_starts: of more starts of games, so many are drawn at random.
         rng: source of the draw; it is left alone where all are kept.
     """
     tried: BoolArray = records.played & ~records.bob_past
-    reset: BoolArray = tried & records.from_reset
     as_proposed: BoolArray = tried & ~(records.replayed & records.from_reset)
-    bins = tasks.index(records.goal[reset], records.start_position[reset], records.start_state[reset])
+    bins = tasks.index(records.goal[tried], records.start_position[tried], records.start_state[tried])
     sums = alice_sums(records, tasks.rest_height_m) | bob_sums(records, tasks.rest_height_m)
     if tasks.some_blocked:
         sums |= _blocked_sums(records, tried, tasks.blocked(records.start_state))
@@ -214,8 +213,8 @@ def summarize(
         reached=reached,
         tries=cells.count(records.goal[as_proposed]),
         successes=cells.count(records.goal[as_proposed & records.solved]),
-        reset_tries=np.bincount(bins, minlength=len(tasks)),
-        reset_successes=np.bincount(bins[records.solved[reset]], minlength=len(tasks)),
+        task_tries=np.bincount(bins, minlength=len(tasks)),
+        task_successes=np.bincount(bins[records.solved[tried]], minlength=len(tasks)),
         metrics=sums,
         heights=count_heights(records),
         goals={name: getattr(records, name)[kept] for name in ("start_state", "start_position", "goal")},

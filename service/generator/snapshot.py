@@ -25,7 +25,7 @@ NUM_DRAWN = 1024
 """Goals drawn in a round for another ``goal_source`` than Alice, of which those that are played are chosen."""
 MIN_REPLAY_GOALS = 64
 """Goals the buffer must hold before any is replayed: fewer would be played over and over."""
-_ARRAYS = ("share", "cell_learnability", "reset_learnability", "novelty", "success_rate", "coverage", "near_reached")
+_ARRAYS = ("share", "learnability", "novelty", "success_rate", "coverage", "near_reached")
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +62,10 @@ class GeneratorSnapshot:
     """(M,) ``goal`` of the replay buffer, and ``start_state`` and ``start_position`` from which it was proposed."""
     share: StateArray
     """(M,) weights of the goals, by the parts of the buffer that they are in."""
-    cell_learnability: StateArray
-    """(cells,) p (1 - p) of goals there."""
     starts: Rows
     """``start_state`` and ``start_position`` of games."""
-    reset_learnability: StateArray
-    """(task bins,) p (1 - p) of what starts where a game does."""
+    learnability: StateArray
+    """(task bins,) p (1 - p) of tasks."""
     novelty: StateArray
     """(cells,) how rare proposals there are, times the share of cells in which none was ever made."""
     success_rate: StateArray
@@ -143,8 +141,7 @@ class GeneratorSnapshot:
 
         The factors, by the buffer's parts, are those of the same goals from the start of a game, too.
         """
-        weight = self._weight(self.cell_learnability, self.cells.index(self.buffer["goal"]))
-        return self.buffer, weight * self.share, self.share
+        return self.buffer, self._weight(**self.buffer) * self.share, self.share
 
     def _drawn_goals(
         self, start_state: StateArray, start_position: StateArray, rng: np.random.Generator
@@ -160,7 +157,7 @@ class GeneratorSnapshot:
         }
         cell = self.cells.index(tasks["goal"])
         share = self.near_reached[cell].astype(np.float64) if source == "reached" else np.ones(NUM_DRAWN)
-        return tasks, self._weight(self.cell_learnability, cell) * self._is_task(**tasks) * share, share
+        return tasks, self._weight(**tasks) * self._is_task(**tasks) * share, share
 
     def _replay(
         self,
@@ -181,8 +178,7 @@ class GeneratorSnapshot:
         if self.config.generator.replay_from_reset and num_starts:
             drawn = rng.choice(num_starts, size=len(goal))
             start = {name: rows[drawn] for name, rows in self.starts.items()}
-            bins = self.tasks.index(goal, start["start_position"], start["start_state"])
-            from_reset = self._weight(self.reset_learnability, bins) * self._is_task(goal, **start) * share
+            from_reset = self._weight(goal, **start) * self._is_task(goal, **start) * share
             weight = np.concatenate([weight, from_reset])
             tasks = join_rows([{name: tasks[name] for name in start}, start])
         drawn = rng.choice(len(weight), size=len(worlds), p=weight / weight.sum())
@@ -191,11 +187,12 @@ class GeneratorSnapshot:
         choice.start_state[worlds] = tasks["start_state"][drawn]
         choice.start_position[worlds] = tasks["start_position"][drawn]
 
-    def _weight(self, learnability: StateArray, bins: IntArray) -> StateArray:
-        """(M,) weights of goals in (M,) bins: what Bob can learn there, or all alike where the source asks for that."""
+    def _weight(self, goal: StateArray, start_state: StateArray, start_position: StateArray) -> StateArray:
+        """(M,) weights of tasks: what Bob can learn from each, or all alike where the source asks for that."""
         if self.config.generator.goal_source in ("alice", "reached", "learnable"):
-            return learnability[bins] + LEARNABILITY_FLOOR
-        return np.ones(len(bins))
+            weight: StateArray = self.learnability[self.tasks.index(goal, start_position, start_state)]
+            return weight + LEARNABILITY_FLOOR
+        return np.ones(len(goal))
 
     def _is_task(self, goal: StateArray, start_state: StateArray, start_position: StateArray) -> BoolArray:
         """(M,) whether the object has to be moved, and can be: a closed gripper lifts nothing, obstacles take room."""
