@@ -117,6 +117,11 @@ class SelfPlay:
         begins = self._round_index == 0
         return {"start_state": self.worlds.states[begins], "start_position": self.worlds.object_position[begins]}
 
+    def round_starts(self) -> Rows:
+        """``start_state`` and ``start_position`` of the rounds that go on with a game."""
+        goes_on = self._round_index > 0
+        return {"start_state": self.worlds.states[goes_on], "start_position": self.worlds.object_position[goes_on]}
+
     def play_round(
         self, players: Players, plan: RoundPlan, choose_goals: ChooseGoals, *, observe: Observer | None = None
     ) -> Rollout:

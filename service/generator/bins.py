@@ -104,9 +104,12 @@ class TaskBins:
     def index(self, goals: StateArray, start_positions: StateArray, start_states: StateArray) -> IntArray:
         """(M,) bin of each task: (M, 3) goal, (M, 3) position of the object and (M, S) state at the start."""
         bins = height_bins(goals, self.rest_height_m) * NUM_DISTANCE_BINS + distance_bins(goals, start_positions)
-        blocked = self.blocked(start_states)
-        held = ~blocked & (start_states[:, self._contacts] > 0.0).all(axis=1)
-        return bins + (held + 2 * blocked) * NUM_TASK_BINS
+        return bins + (self.held(start_states) + 2 * self.blocked(start_states)) * NUM_TASK_BINS
+
+    def held(self, states: StateArray) -> BoolArray:
+        """(M,) whether in (M, S) states a free gripper holds the object: both fingers touched it."""
+        held: BoolArray = (states[:, self._contacts] > 0.0).all(axis=1) & ~self.blocked(states)
+        return held
 
     def blocked(self, states: StateArray) -> BoolArray:
         """(M,) whether the gripper of (M, S) states is blocked; none is where states have no such flag."""

@@ -75,6 +75,8 @@ class TaskGenerator:
         """Earlier valid goals and the states they came from, drawn by learnability (Rutherford et al. 2024)."""
         self.starts = Ring(NUM_STARTS, **columns)
         """States right after a reset."""
+        self.held_starts = Ring(NUM_STARTS, **columns)
+        """States at the start of a later round in which the gripper holds the object."""
         self.opponents = Opponents(0)
         """Past versions of both players."""
         self.difficulty = SuccessCounts(len(self.tasks))
@@ -84,6 +86,7 @@ class TaskGenerator:
             "grid": self.grid,
             "buffer": self.buffer,
             "starts": self.starts,
+            "held_starts": self.held_starts,
             "difficulty": self.difficulty,
             "stop": self._stop,
         }
@@ -98,6 +101,7 @@ class TaskGenerator:
             buffer=buffer,
             share=self._replay_share(buffer["goal"]),
             starts=self.starts.rows(),
+            held_starts=self.held_starts.rows(),
             learnability=self.difficulty.learnability(),
             novelty=self.grid.novelty() * (1.0 - coverage),
             success_rate=np.array(self.grid.mean_success_rate()),
@@ -127,6 +131,7 @@ class TaskGenerator:
             ``alice/*``, ``bob/*`` and ``generator/*`` metrics; a rate over no cases is left out.
         """
         self.starts.add(None, **summary.starts)
+        self.held_starts.add(None, **summary.held_starts)
         num_new_cells = self.grid.record(summary.proposed, summary.reached, summary.tries, summary.successes)
         self.difficulty.record(summary.task_tries, summary.task_successes)
         cell = self.cells.index(summary.goals["goal"]) if self._config.generator.replay_over_cells else None

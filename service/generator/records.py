@@ -170,6 +170,8 @@ class GoalSummary:
     """(M,) valid ``goal`` that Bob played straight from Alice, with ``start_state`` and ``start_position``."""
     starts: Rows
     """``start_state`` and ``start_position`` of the games that began."""
+    held_starts: Rows
+    """The same of later rounds in which the gripper held the object."""
     shown: StateArray
     """(L, 7) of ``sampled_goals``, for the run directory."""
 
@@ -177,6 +179,7 @@ class GoalSummary:
 def summarize(
     records: GoalRecords,
     starts: Rows,
+    later_starts: Rows,
     reached: IntArray,
     cells: GoalCells,
     tasks: TaskBins,
@@ -208,6 +211,7 @@ def summarize(
         sums |= _blocked_sums(records, tried, tasks.blocked(records.start_state))
     kept = _some(np.flatnonzero(records.own), max_goals, rng)
     began = _some(np.arange(len(starts["start_position"])), max_starts, rng)
+    held = _some(np.flatnonzero(tasks.held(later_starts["start_state"])), max_starts, rng)
     return GoalSummary(
         proposed=cells.count(records.proposal[records.verdict == Verdict.VALID]),
         reached=reached,
@@ -219,6 +223,7 @@ def summarize(
         heights=count_heights(records),
         goals={name: getattr(records, name)[kept] for name in ("start_state", "start_position", "goal")},
         starts={name: rows[began] for name, rows in starts.items()},
+        held_starts={name: rows[held] for name, rows in later_starts.items()},
         shown=sampled_goals(records),
     )
 
@@ -233,6 +238,7 @@ def join_summaries(summaries: Sequence[GoalSummary]) -> GoalSummary:
         metrics=_join_sums(parts["metrics"]),
         goals=join_rows(parts["goals"]),
         starts=join_rows(parts["starts"]),
+        held_starts=join_rows(parts["held_starts"]),
         shown=np.concatenate(parts["shown"])[:GOALS_PER_ITERATION],
     )
 

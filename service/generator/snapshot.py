@@ -64,6 +64,8 @@ class GeneratorSnapshot:
     """(M,) weights of the goals, by the parts of the buffer that they are in."""
     starts: Rows
     """``start_state`` and ``start_position`` of games."""
+    held_starts: Rows
+    """The same of later rounds in which the gripper holds the object."""
     learnability: StateArray
     """(task bins,) p (1 - p) of tasks."""
     novelty: StateArray
@@ -118,13 +120,13 @@ class GeneratorSnapshot:
     def state(self) -> Arrays:
         """All arrays by flat names."""
         arrays: Arrays = {name: getattr(self, name) for name in _ARRAYS}
-        return arrays | join_parts({"buffer": self.buffer, "starts": self.starts})
+        return arrays | join_parts({"buffer": self.buffer, "starts": self.starts, "held_starts": self.held_starts})
 
     def with_state(self, state: Mapping[str, Array]) -> GeneratorSnapshot:
         """A snapshot with the arrays that ``state`` gave, and all else from this one."""
         parts = split_parts(state)
         arrays: dict[str, Any] = {name: state[name] for name in _ARRAYS}
-        return replace(self, **arrays, buffer=parts["buffer"], starts=parts["starts"])
+        return replace(self, **arrays, buffer=parts["buffer"], starts=parts["starts"], held_starts=parts["held_starts"])
 
     def _choose_replayed(self, valid: BoolArray, bob_past: BoolArray, rng: np.random.Generator) -> BoolArray:
         """(N,) worlds whose goal comes from the buffer."""
@@ -146,8 +148,16 @@ class GeneratorSnapshot:
     def _drawn_goals(
         self, start_state: StateArray, start_position: StateArray, rng: np.random.Generator
     ) -> tuple[Rows, StateArray, StateArray]:
-        """Goals that Alice did not propose, each from where some world is now; see ``_earlier_goals``."""
+        """Goals that Alice did not propose, each from where some world is now, or was with the object in its hand.
+
+        See ``_earlier_goals``.
+        """
         game, source = self.config.game, self.config.generator.goal_source
+        if len(self.held_starts["start_position"]):
+            # As many as there are worlds, so that half of all begin in the hand.
+            held = rng.integers(len(self.held_starts["start_position"]), size=len(start_state))
+            start_state = np.concatenate([start_state, self.held_starts["start_state"][held]])
+            start_position = np.concatenate([start_position, self.held_starts["start_position"][held]])
         rows = rng.integers(len(start_state), size=NUM_DRAWN)
         kind: GoalKind = "table" if source == "table" else "mixed"
         tasks = {
