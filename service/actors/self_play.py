@@ -112,15 +112,9 @@ class SelfPlay:
         self.worlds.reset(self._rng)
         self._round_index[:] = 0
 
-    def game_starts(self) -> Rows:
-        """``start_state`` and ``start_position`` of the games that the next round begins."""
-        begins = self._round_index == 0
-        return {"start_state": self.worlds.states[begins], "start_position": self.worlds.object_position[begins]}
-
     def round_starts(self) -> Rows:
-        """``start_state`` and ``start_position`` of the rounds that go on with a game."""
-        goes_on = self._round_index > 0
-        return {"start_state": self.worlds.states[goes_on], "start_position": self.worlds.object_position[goes_on]}
+        """(N,) ``start_state`` and ``start_position`` of the next round; copies."""
+        return {"start_state": self.worlds.states.copy(), "start_position": self.worlds.object_position.copy()}
 
     def play_round(
         self, players: Players, plan: RoundPlan, choose_goals: ChooseGoals, *, observe: Observer | None = None

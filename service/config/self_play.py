@@ -112,11 +112,6 @@ class GeneratorConfig(FrozenModel):
     replay_from_reset: bool = Field(
         False, description="replayed goals also start where games do, when Bob can learn from that"
     )
-    replay_over_cells: bool = Field(
-        False,
-        description="keep equally many goals of every cell and draw the cells alike, but for what Bob can learn there: "
-        "what Alice has left behind is not forgotten",
-    )
     replay_buffer_size: int = Field(4096, ge=1)
     cell_size_m: float = Field(0.05, gt=0.0, description="edge of a goal cell of the difficulty grid")
     novelty_window: int = Field(50, ge=1, description="iterations without a new cell before the run may stop")

@@ -104,7 +104,8 @@ class TaskBins:
     def index(self, goals: StateArray, start_positions: StateArray, start_states: StateArray) -> IntArray:
         """(M,) bin of each task: (M, 3) goal, (M, 3) position of the object and (M, S) state at the start."""
         bins = height_bins(goals, self.rest_height_m) * NUM_DISTANCE_BINS + distance_bins(goals, start_positions)
-        return bins + (self.held(start_states) + 2 * self.blocked(start_states)) * NUM_TASK_BINS
+        kind: IntArray = self.held(start_states) + 2 * self.blocked(start_states).astype(np.int64)
+        return bins + kind * NUM_TASK_BINS
 
     def held(self, states: StateArray) -> BoolArray:
         """(M,) whether in (M, S) states a free gripper holds the object: both fingers touched it."""

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from service.base.tensors import join_parts, split_parts
-from service.base.types import Array, Arrays, Metrics, StateArray
+from service.base.types import Array, Arrays, Metrics
 from service.config.self_play import GeneratorConfig, SelfPlayConfig
 from service.envs.state_layout import StateLayout
-from service.generator.bins import GoalCells, TaskBins, in_air
+from service.generator.bins import GoalCells, TaskBins
 from service.generator.difficulty import DifficultyGrid, SuccessCounts
 from service.generator.opponents import Opponents
 from service.generator.records import GoalSummary, height_percentile, means
@@ -70,8 +70,7 @@ class TaskGenerator:
         self.grid = DifficultyGrid(self.cells)
         """Bob's success over goal cells."""
         columns = {"start_state": layout.size, "start_position": 3}
-        num_parts = len(self.cells) if config.generator.replay_over_cells else 1
-        self.buffer = Ring(config.generator.replay_buffer_size, num_parts, **columns, goal=3)
+        self.buffer = Ring(config.generator.replay_buffer_size, **columns, goal=3)
         """Earlier valid goals and the states they came from, drawn by learnability (Rutherford et al. 2024)."""
         self.starts = Ring(NUM_STARTS, **columns)
         """States right after a reset."""
@@ -93,13 +92,12 @@ class TaskGenerator:
 
     def snapshot(self) -> GeneratorSnapshot:
         """All that rollout workers need to choose goals in the next round; a copy."""
-        buffer, coverage = self.buffer.rows(), self.grid.seen.mean()
+        coverage = self.grid.seen.mean()
         return GeneratorSnapshot(
             config=self._config,
             cells=self.cells,
             tasks=self.tasks,
-            buffer=buffer,
-            share=self._replay_share(buffer["goal"]),
+            buffer=self.buffer.rows(),
             starts=self.starts.rows(),
             held_starts=self.held_starts.rows(),
             learnability=self.difficulty.learnability(),
@@ -108,18 +106,6 @@ class TaskGenerator:
             coverage=np.array(coverage),
             near_reached=self.grid.near_reached(),
         )
-
-    def _replay_share(self, goal: StateArray) -> StateArray:
-        """(M,) weights of the buffer's goals: its parts are equally likely, and over cells the table and the air.
-
-        The table is one layer of cells of seven, yet where most of what is asked of Bob begins or ends.
-        """
-        share = self.buffer.part_share()
-        if self._config.generator.replay_over_cells:
-            air = in_air(goal, self.tasks.rest_height_m)
-            for part in (air, ~air):
-                share[part] /= max(share[part].sum(), 1e-12)
-        return share
 
     def record(self, summary: GoalSummary) -> Metrics:
         """Take in the outcomes of one iteration's goals.
@@ -130,12 +116,11 @@ class TaskGenerator:
         Returns:
             ``alice/*``, ``bob/*`` and ``generator/*`` metrics; a rate over no cases is left out.
         """
-        self.starts.add(None, **summary.starts)
-        self.held_starts.add(None, **summary.held_starts)
+        self.starts.add(**summary.starts)
+        self.held_starts.add(**summary.held_starts)
         num_new_cells = self.grid.record(summary.proposed, summary.reached, summary.tries, summary.successes)
         self.difficulty.record(summary.task_tries, summary.task_successes)
-        cell = self.cells.index(summary.goals["goal"]) if self._config.generator.replay_over_cells else None
-        self.buffer.add(cell, **summary.goals)
+        self.buffer.add(**summary.goals)
         self._stop.record(num_new_cells, int(summary.task_tries.sum()), int(summary.task_successes.sum()))
         metrics = {
             **means(summary.metrics),

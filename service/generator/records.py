@@ -179,7 +179,6 @@ class GoalSummary:
 def summarize(
     records: GoalRecords,
     starts: Rows,
-    later_starts: Rows,
     reached: IntArray,
     cells: GoalCells,
     tasks: TaskBins,
@@ -195,12 +194,12 @@ def summarize(
 
     Args:
         records: of the round.
-        starts: of the games that began with it.
+        starts: (N,) of the round, where Alice's turns began.
         reached: (cells,) steps of the round after which an object was there.
         cells: of goals.
         tasks: bins of tasks.
         max_goals: of more new goals for the buffer, so many are drawn at random.
-        max_starts: of more starts of games, so many are drawn at random.
+        max_starts: of more starts of either kind, so many are drawn at random.
         rng: source of the draw; it is left alone where all are kept.
     """
     tried: BoolArray = records.played & ~records.bob_past
@@ -210,8 +209,9 @@ def summarize(
     if tasks.some_blocked:
         sums |= _blocked_sums(records, tried, tasks.blocked(records.start_state))
     kept = _some(np.flatnonzero(records.own), max_goals, rng)
-    began = _some(np.arange(len(starts["start_position"])), max_starts, rng)
-    held = _some(np.flatnonzero(tasks.held(later_starts["start_state"])), max_starts, rng)
+    begins: BoolArray = records.round_index == 0
+    began = _some(np.flatnonzero(begins), max_starts, rng)
+    held = _some(np.flatnonzero(~begins & tasks.held(starts["start_state"])), max_starts, rng)
     return GoalSummary(
         proposed=cells.count(records.proposal[records.verdict == Verdict.VALID]),
         reached=reached,
@@ -223,7 +223,7 @@ def summarize(
         heights=count_heights(records),
         goals={name: getattr(records, name)[kept] for name in ("start_state", "start_position", "goal")},
         starts={name: rows[began] for name, rows in starts.items()},
-        held_starts={name: rows[held] for name, rows in later_starts.items()},
+        held_starts={name: rows[held] for name, rows in starts.items()},
         shown=sampled_goals(records),
     )
 

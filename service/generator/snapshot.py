@@ -20,12 +20,12 @@ from service.generator.ring import Rows, join_rows
 from service.generator.validity import Verdict
 
 LEARNABILITY_FLOOR = 0.01
-"""Added to p (1 - p), which is at most 1/4, so goals of a solved or hopeless cell stay drawable and measured."""
+"""Added to p (1 - p), which is at most 1/4, so solved and hopeless tasks stay drawable and measured."""
 NUM_DRAWN = 1024
 """Goals drawn in a round for another ``goal_source`` than Alice, of which those that are played are chosen."""
 MIN_REPLAY_GOALS = 64
 """Goals the buffer must hold before any is replayed: fewer would be played over and over."""
-_ARRAYS = ("share", "learnability", "novelty", "success_rate", "coverage", "near_reached")
+_ARRAYS = ("learnability", "novelty", "success_rate", "coverage", "near_reached")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +49,25 @@ class GoalChoice:
 
 
 @dataclass(frozen=True, slots=True)
+class _Tasks:
+    """Tasks that Bob may get instead of Alice's: goals and starts."""
+
+    rows: Rows
+    """(M,) ``goal``, ``start_state`` and ``start_position``."""
+    weight: StateArray
+    """(M,)."""
+    num_others: int
+    """Those behind so many begin where a game does."""
+
+    def give(self, choice: GoalChoice, worlds: IntArray, rng: np.random.Generator) -> None:
+        """Give each of ``worlds`` one of them."""
+        drawn = rng.choice(len(self.weight), size=len(worlds), p=self.weight / self.weight.sum())
+        choice.from_reset[worlds] = drawn >= self.num_others
+        for name, column in self.rows.items():
+            getattr(choice, name)[worlds] = column[drawn]
+
+
+@dataclass(frozen=True, slots=True)
 class GeneratorSnapshot:
     """All that the choice of goals needs, as it was after some iteration: plain arrays, read only.
 
@@ -60,8 +79,6 @@ class GeneratorSnapshot:
     tasks: TaskBins
     buffer: Rows
     """(M,) ``goal`` of the replay buffer, and ``start_state`` and ``start_position`` from which it was proposed."""
-    share: StateArray
-    """(M,) weights of the goals, by the parts of the buffer that they are in."""
     starts: Rows
     """``start_state`` and ``start_position`` of games."""
     held_starts: Rows
@@ -103,18 +120,17 @@ class GeneratorSnapshot:
             rng: source of the choice.
         """
         valid: BoolArray = verdict == Verdict.VALID
-        replayed, goals = self._choose_replayed(valid, plan.bob_past, rng), None
+        replayed, tasks = self._choose_replayed(valid, plan.bob_past, rng), None
         if replayed.any():
-            own = self.config.generator.goal_source == "alice"
-            goals = self._earlier_goals() if own else self._drawn_goals(start_state, start_position, rng)
-            replayed &= goals[1].any()
+            tasks = self._other_tasks(start_state, start_position, rng)
+            replayed &= tasks.weight.any()
         starts = start_state.copy(), start_position.copy()
         from_reset = (round_index == 0) & ~replayed
         novelty = np.zeros(len(proposal))
         novelty[valid] = self.novelty[self.cells.index(proposal[valid])]
         choice = GoalChoice(proposal.copy(), *starts, replayed, from_reset, valid | replayed, novelty)
-        if goals is not None and replayed.any():
-            self._replay(choice, np.flatnonzero(replayed), *goals, rng)
+        if tasks is not None and replayed.any():
+            tasks.give(choice, np.flatnonzero(replayed), rng)
         return choice
 
     def state(self) -> Arrays:
@@ -138,64 +154,32 @@ class GeneratorSnapshot:
         filled: BoolArray = ~valid & config.replay_invalid
         return (replaced | filled) & ~bob_past
 
-    def _earlier_goals(self) -> tuple[Rows, StateArray, StateArray]:
-        """Alice's earlier goals from the starts they were proposed from, their (M,) weights, and (M,) factors in these.
-
-        The factors, by the buffer's parts, are those of the same goals from the start of a game, too.
-        """
-        return self.buffer, self._weight(**self.buffer) * self.share, self.share
-
-    def _drawn_goals(
-        self, start_state: StateArray, start_position: StateArray, rng: np.random.Generator
-    ) -> tuple[Rows, StateArray, StateArray]:
-        """Goals that Alice did not propose, each from where some world is now, or was with the object in its hand.
-
-        See ``_earlier_goals``.
-        """
-        game, source = self.config.game, self.config.generator.goal_source
-        if len(self.held_starts["start_position"]):
-            # As many as there are worlds, so that half of all begin in the hand.
-            held = rng.integers(len(self.held_starts["start_position"]), size=len(start_state))
-            start_state = np.concatenate([start_state, self.held_starts["start_state"][held]])
-            start_position = np.concatenate([start_position, self.held_starts["start_position"][held]])
-        rows = rng.integers(len(start_state), size=NUM_DRAWN)
-        kind: GoalKind = "table" if source == "table" else "mixed"
-        tasks = {
-            "goal": sample_goals(kind, rng, NUM_DRAWN, self.config.world, game.success_distance_m),
-            "start_state": start_state[rows],
-            "start_position": start_position[rows],
-        }
-        cell = self.cells.index(tasks["goal"])
-        share = self.near_reached[cell].astype(np.float64) if source == "reached" else np.ones(NUM_DRAWN)
-        return tasks, self._weight(**tasks) * self._is_task(**tasks) * share, share
-
-    def _replay(
-        self,
-        choice: GoalChoice,
-        worlds: IntArray,
-        tasks: Rows,
-        weight: StateArray,
-        share: StateArray,
-        rng: np.random.Generator,
-    ) -> None:
-        """Give ``worlds`` some of the tasks, from their own start or from that of some game.
+    def _other_tasks(self, start_state: StateArray, start_position: StateArray, rng: np.random.Generator) -> _Tasks:
+        """Draw tasks besides those that Alice has just set: other goals, and the same again from starts of games.
 
         Whatever is asked of Bob downstream begins with a reset, but Alice reaches far goals over several rounds, so few
-        of her own do. Both kinds of task compete by learnability: far goals from a reset wait until Bob is ready.
+        of her own do. All compete by learnability: far goals from a reset wait until Bob is ready.
         """
-        # Each goal is one from its own start and, behind all of these, one from the start of a game.
-        goal, num_starts = tasks["goal"], len(self.starts["start_position"])
-        if self.config.generator.replay_from_reset and num_starts:
-            drawn = rng.choice(num_starts, size=len(goal))
-            start = {name: rows[drawn] for name, rows in self.starts.items()}
-            from_reset = self._weight(goal, **start) * self._is_task(goal, **start) * share
-            weight = np.concatenate([weight, from_reset])
-            tasks = join_rows([{name: tasks[name] for name in start}, start])
-        drawn = rng.choice(len(weight), size=len(worlds), p=weight / weight.sum())
-        choice.goal[worlds] = goal[drawn % len(goal)]
-        choice.from_reset[worlds] = drawn >= len(goal)
-        choice.start_state[worlds] = tasks["start_state"][drawn]
-        choice.start_position[worlds] = tasks["start_position"][drawn]
+        config = self.config.generator
+        if config.goal_source == "alice":
+            rows = self.buffer
+        else:
+            goal, starts = self._new_goals(rng), {"start_state": start_state, "start_position": start_position}
+            if len(self.held_starts["start_position"]):
+                # Every second start is in the hand: he learns to carry long before he learns to grasp.
+                starts = join_rows([starts, _drawn(self.held_starts, len(start_state), rng)])
+            rows = {"goal": goal} | _drawn(starts, len(goal), rng)
+        num = len(rows["goal"])
+        if config.replay_from_reset and len(self.starts["start_position"]):
+            rows = join_rows([rows, {"goal": rows["goal"]} | _drawn(self.starts, num, rng)])
+        return _Tasks(rows, self._weight(**rows) * self._is_task(**rows), num)
+
+    def _new_goals(self, rng: np.random.Generator) -> StateArray:
+        """(M, 3) goals that Alice did not propose, metres."""
+        source = self.config.generator.goal_source
+        kind: GoalKind = "table" if source == "table" else "mixed"
+        goal = sample_goals(kind, rng, NUM_DRAWN, self.config.world, self.config.game.success_distance_m)
+        return goal[self.near_reached[self.cells.index(goal)]] if source == "reached" else goal
 
     def _weight(self, goal: StateArray, start_state: StateArray, start_position: StateArray) -> StateArray:
         """(M,) weights of tasks: what Bob can learn from each, or all alike where the source asks for that."""
@@ -211,3 +195,9 @@ class GeneratorSnapshot:
         if world.obstacles:
             far &= ~inside_obstacles(goal, obstacle_places(start_state, self.tasks.obstacles), world)
         return far & ~(self.tasks.blocked(start_state) & in_air(goal, self.tasks.rest_height_m))
+
+
+def _drawn(rows: Rows, num: int, rng: np.random.Generator) -> Rows:
+    """Draw ``num`` of the rows."""
+    drawn = rng.integers(len(next(iter(rows.values()))), size=num)
+    return {name: column[drawn] for name, column in rows.items()}

@@ -84,14 +84,13 @@ class RolloutWorker:
         start = time.perf_counter()
         config = self._config.generator
         self.game.block_grippers(float(snapshot.success_rate))
-        starts, later_starts = self.game.game_starts(), self.game.round_starts()
+        starts = self.game.round_starts()
         plan = opponents.plan(self.game.worlds.num_worlds, config.past_opponent_fraction, self.rng)
         choose_goals = partial(snapshot.choose_goals, plan, rng=self.rng)
         rollout = self.game.play_round(self._players(weights, opponents), plan, choose_goals)
         goals = summarize(
             rollout.records,
             starts,
-            later_starts,
             self.game.reached,
             self.game.cells,
             self._tasks,
