@@ -6,18 +6,40 @@ from typing import Any
 
 import numpy as np
 
-from service.base.types import Metrics
+from service.base.types import Array, BoolArray, Metrics, StateArray
+from service.envs.state_layout import StateLayout
 from service.generator.bins import GoalCells, TaskBins
 from service.generator.generator import TaskGenerator
 from service.generator.records import GoalRecords, GoalSummary, summarize
 from service.generator.ring import Rows
 from service.generator.validity import Verdict
 
-STATE_SIZE = 4
+FREE = StateLayout(positions={"object": 3}, velocities={}, measured={"contacts": 2}, kept={"gripper_blocked": 0})
+SOME_BLOCKED = StateLayout(
+    positions={}, velocities={}, measured={"contacts": 2}, kept={"gripper_blocked": 1, "object_mass": 2}
+)
+"""Two small worlds of six numbers; contacts are elsewhere, and the flag is not the last of them."""
+STATE_SIZE = FREE.size
+
+
+def make_states(
+    num: int,
+    layout: StateLayout = FREE,
+    *,
+    mark: float | Array = 0.0,
+    held: bool | BoolArray = False,
+    blocked: bool | BoolArray = False,
+) -> StateArray:
+    """(N, S) states by whose time, their first number, a test knows them again; zeros, but for what is asked."""
+    states = np.zeros((num, layout.size))
+    states[:, 0] = mark
+    states[:, layout["contacts"]] = np.reshape(held, (-1, 1))
+    states[:, layout["gripper_blocked"]] = np.reshape(blocked, (-1, 1))
+    return states
 
 
 def make_records(proposal: Any, **overrides: Any) -> GoalRecords:
-    """N valid goals, played as proposed by the current players and failed, from an object at the origin."""
+    """N valid goals of second rounds, from the origin, played as proposed by the current players and failed."""
     proposal = np.asarray(proposal, dtype=np.float64).reshape(-1, 3)
     num = len(proposal)
     fields: dict[str, Any] = {
@@ -33,30 +55,36 @@ def make_records(proposal: Any, **overrides: Any) -> GoalRecords:
         "num_bob_steps": np.full(num, 40),
         "alice_past": np.zeros(num, dtype=np.bool_),
         "bob_past": np.zeros(num, dtype=np.bool_),
-        "round_index": np.zeros(num, dtype=np.int64),
+        "round_index": np.ones(num, dtype=np.int64),
     }
     return GoalRecords(**{**fields, **{name: np.asarray(value) for name, value in overrides.items()}})
 
 
-def starts_of(*states: list[float]) -> Rows:
-    """Games that begin in these states, with the object at (0, 0, 0.025)."""
-    return {
-        "start_state": np.array(states, dtype=np.float64),
-        "start_position": np.tile([0.0, 0.0, 0.025], (len(states), 1)),
-    }
+def make_starts(states: StateArray, position: Any = (0.0, 0.0, 0.025)) -> Rows:
+    """Starts in (N, S) states with the object at a position."""
+    return {"start_state": states, "start_position": np.tile(position, (len(states), 1))}
+
+
+def only_starts(starts: Rows, *, round_index: int = 0) -> GoalRecords:
+    """Worlds that began a round somewhere, in which Alice then threw the object off the table: nothing was played."""
+    num = len(starts["start_state"])
+    fallen, no = np.full(num, Verdict.FALLEN, dtype=np.int8), np.zeros(num, dtype=np.bool_)
+    return make_records(
+        np.full((num, 3), np.nan), **starts, verdict=fallen, played=no, round_index=np.full(num, round_index)
+    )
 
 
 def summary_of(
     records: GoalRecords, cells: GoalCells, tasks: TaskBins, starts: Rows | None = None, **limits: int
 ) -> GoalSummary:
-    """Summary of a round in which no game began, unless ``starts`` are given; nothing is left out without limits.
+    """Summary of a round that began where Bob's turns did, unless ``starts`` are given; all is kept without limits.
 
     The object was nowhere but at its goals.
     """
-    none = {"start_state": np.zeros((0, records.start_state.shape[1])), "start_position": np.zeros((0, 3))}
+    starts = starts or {"start_state": records.start_state, "start_position": records.start_position}
     most = {"max_goals": 10**6, "max_starts": 10**6} | limits
     reached = cells.count(records.proposal[records.verdict == Verdict.VALID])
-    return summarize(records, starts or none, reached, cells, tasks, rng=np.random.default_rng(0), **most)
+    return summarize(records, starts, reached, cells, tasks, rng=np.random.default_rng(0), **most)
 
 
 def record(generator: TaskGenerator, records: GoalRecords, starts: Rows | None = None) -> Metrics:

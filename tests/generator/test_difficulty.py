@@ -5,10 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.config import WorkspaceConfig, WorldConfig
-from service.generator.bins import NUM_DISTANCE_BINS, NUM_TASK_BINS, GoalCells, distance_bins, height_bins, in_air
+from service.config import WorkspaceConfig, WorldConfig, parse_config
+from service.generator.bins import (
+    NUM_DISTANCE_BINS,
+    NUM_TASK_BINS,
+    GoalCells,
+    TaskBins,
+    distance_bins,
+    height_bins,
+    in_air,
+)
 from service.generator.difficulty import MEMORY_TRIES, PROPOSAL_DECAY, DifficultyGrid, SuccessCounts
 from service.methods.method import goal_grid
+from tests.generator.outcomes import FREE, SOME_BLOCKED, make_states
 
 WORLD = WorldConfig(workspace=WorkspaceConfig(center_x_m=0.1, center_y_m=0.0))
 
@@ -161,3 +170,31 @@ def test_bins_of_distance_and_height_by_hand() -> None:
     assert distance_bins(goals, starts).tolist() == [0, 1, 2, 2, 4]
     assert height_bins(goals, 0.025).tolist() == [0, 0, 0, 2, 3]
     assert (NUM_DISTANCE_BINS, NUM_TASK_BINS) == (5, 20)
+
+
+def make_tasks(blocked_fraction: float) -> TaskBins:
+    config = parse_config({"game": {"blocked_gripper_fraction": blocked_fraction}}, where="test")
+    return TaskBins(config, SOME_BLOCKED if blocked_fraction else FREE)
+
+
+def test_an_object_is_held_where_both_fingers_of_a_free_gripper_touch_it() -> None:
+    states = make_states(6, SOME_BLOCKED)
+    states[:, SOME_BLOCKED["contacts"]] = [(0, 0), (1, 0), (0, 1), (1, 1), (1, 1), (0, 0)]
+    states[:, SOME_BLOCKED["gripper_blocked"]] = np.array([[0, 0, 0, 0, 1, 1]]).T
+    tasks = make_tasks(0.2)
+    assert tasks.held(states).tolist() == [False, False, False, True, False, False]
+    assert tasks.blocked(states).tolist() == [False, False, False, False, True, True]
+    free = make_states(2, held=np.array([False, True]))  # of worlds in which no gripper is ever blocked
+    assert make_tasks(0.0).held(free).tolist() == [False, True]
+
+
+def test_bins_of_the_same_goal_by_what_the_gripper_does() -> None:
+    """In the air, 18 cm away: 2 * 5 + 2 while it is free, 20 on where it holds the object, 40 where it is blocked."""
+    goals, starts = np.tile([0.1, 0.0, 0.205], (4, 1)), np.tile([0.1, 0.0, 0.025], (4, 1))
+    states = make_states(4, SOME_BLOCKED, held=np.array([0, 1, 0, 1]) > 0, blocked=np.array([0, 0, 1, 1]) > 0)
+    tasks = make_tasks(0.2)
+    assert tasks.index(goals, starts, states).tolist() == [12, 32, 52, 52]
+    assert len(tasks) == 60
+    never_blocked = make_tasks(0.0)
+    assert never_blocked.index(goals[:2], starts[:2], make_states(2, held=np.array([False, True]))).tolist() == [12, 32]
+    assert len(never_blocked) == 40

@@ -11,20 +11,30 @@ import pytest
 
 from service.config import Config, parse_config
 from service.config.self_play import GeneratorConfig
-from service.envs.state_layout import StateLayout
+from service.generator.bins import NUM_TASK_BINS
 from service.generator.difficulty import MEMORY_TRIES
-from service.generator.generator import StopCriterion, TaskGenerator
+from service.generator.generator import NUM_STARTS, StopCriterion, TaskGenerator
 from service.generator.opponents import CURRENT, RoundPlan
+from service.generator.records import GoalRecords
 from service.generator.ring import Rows
 from service.generator.snapshot import LEARNABILITY_FLOOR, MIN_REPLAY_GOALS, GeneratorSnapshot, GoalChoice
 from service.generator.validity import Verdict
-from tests.generator.outcomes import make_records, record, starts_of
+from tests.generator.outcomes import (
+    FREE,
+    SOME_BLOCKED,
+    STATE_SIZE,
+    make_records,
+    make_starts,
+    make_states,
+    only_starts,
+    record,
+    summary_of,
+)
 
-FREE = StateLayout(positions={"object": 3}, velocities={}, measured={}, kept={"gripper_blocked": 0})
-SOME_BLOCKED = StateLayout(positions={}, velocities={}, measured={}, kept={"gripper_blocked": 1, "object_mass": 2})
-"""Two small worlds of four numbers; the flag is not the last of them."""
-STATE_SIZE = FREE.size
-ONE_GAME = starts_of([1.0] * STATE_SIZE)
+WORLD, GAME, OLD, HELD = 1.0, 2.0, 7.0, 9.0
+"""Marks of states: where worlds are now, of a game that began, of the old goal, and of an object in the hand."""
+ONE_GAME = make_starts(make_states(1, mark=GAME), position=(0.0, -0.15, 0.025))
+"""Its object is 25 cm from the old goal, and not 10 as where that was proposed."""
 BLOCKED = SOME_BLOCKED["gripper_blocked"].start
 OLD_GOAL = (0.0, 0.1, 0.025)
 VALID, OUTSIDE = int(Verdict.VALID), int(Verdict.OUTSIDE)
@@ -45,10 +55,12 @@ def all_current(num: int) -> RoundPlan:
 
 
 def filled(num_goals: int = MIN_REPLAY_GOALS, starts: Rows | None = None, **settings: Any) -> TaskGenerator:
-    """A generator whose buffer holds ``num_goals`` times the same old goal, from a state of sevens."""
+    """A generator whose buffer holds ``num_goals`` times the same old goal; games began in ``starts``."""
     generator = TaskGenerator(config(**settings), FREE)
-    states = np.full((num_goals, STATE_SIZE), 7.0)
-    record(generator, make_records(np.tile(OLD_GOAL, (num_goals, 1)), start_state=states), starts)
+    states = make_states(num_goals, mark=OLD)
+    record(generator, make_records(np.tile(OLD_GOAL, (num_goals, 1)), start_state=states))
+    if starts is not None:
+        record(generator, only_starts(starts))
     return generator
 
 
@@ -59,12 +71,12 @@ def choose(
     seed: int = 0,
     coverage: float = 1.0,
 ) -> GoalChoice:
-    """Goals of worlds whose Alices all proposed (-0.1, 0, 0.1), from a state of ones at (0, 0, 0.025)."""
+    """Goals of worlds whose Alices all proposed (-0.1, 0, 0.1) of an object at (0, 0, 0.025)."""
     num = len(verdict)
     snapshot = source.snapshot() if isinstance(source, TaskGenerator) else source
     return replace(snapshot, coverage=np.array(coverage)).choose_goals(
         plan or all_current(num),
-        np.ones((num, STATE_SIZE)),
+        make_states(num, mark=WORLD),
         np.tile([0.0, 0.0, 0.025], (num, 1)),
         np.arange(num),
         np.tile([-0.1, 0.0, 0.1], (num, 1)),
@@ -78,7 +90,7 @@ def assert_rows(choice: GoalChoice, replayed: list[bool]) -> None:
     assert choice.replayed.tolist() == replayed
     for index, old in enumerate(replayed):
         assert choice.goal[index].tolist() == (list(OLD_GOAL) if old else [-0.1, 0.0, 0.1])
-        assert choice.start_state[index].tolist() == [7.0 if old else 1.0] * STATE_SIZE
+        assert choice.start_state[index].tolist() == [OLD if old else WORLD] + [0.0] * (STATE_SIZE - 1)
         assert choice.start_position[index].tolist() == [0.0, 0.0, 0.025]
 
 
@@ -124,7 +136,7 @@ def test_replay_fraction_waits_for_coverage() -> None:
 def test_no_replay_before_the_buffer_holds_enough() -> None:
     generator = filled(MIN_REPLAY_GOALS - 1, replay_fraction=1.0, replay_invalid=True)
     assert_rows(choose(generator, [VALID, OUTSIDE]), [False, False])
-    record(generator, make_records(OLD_GOAL, start_state=np.full((1, STATE_SIZE), 7.0)))
+    record(generator, make_records(OLD_GOAL, start_state=make_states(1, mark=OLD)))
     assert_rows(choose(generator, [VALID, OUTSIDE]), [True, True])
 
 
@@ -132,12 +144,12 @@ def test_replayed_goals_may_start_where_a_game_did() -> None:
     generator = filled(starts=ONE_GAME, replay_fraction=1.0, replay_from_reset=True)
     num_tries, num = MIN_REPLAY_GOALS, 2000
     first = choose(generator, [VALID] * num)
-    # From their own starts the old goals were tried and failed; from a reset nothing is known, so 1/2.
+    # From their own starts the old goals were tried and failed; from so far away nothing is known, so 1/2.
     rate = 1 / (remembered(num_tries) + 2)
     own = rate * (1 - rate) + LEARNABILITY_FLOOR
     share = (0.25 + LEARNABILITY_FLOOR) / (0.25 + LEARNABILITY_FLOOR + own)
     assert first.from_reset.mean() == pytest.approx(share, abs=3 * np.sqrt(share * (1 - share) / num))
-    assert (first.start_state[:, 0] == np.where(first.from_reset, 1.0, 7.0)).all()
+    assert (first.start_state[:, 0] == np.where(first.from_reset, GAME, OLD)).all()
     assert first.replayed.all()
     assert (first.goal == OLD_GOAL).all()
     switched_off = filled(starts=ONE_GAME, replay_fraction=1.0, replay_from_reset=False)
@@ -146,18 +158,19 @@ def test_replayed_goals_may_start_where_a_game_did() -> None:
 
 def test_tasks_from_a_reset_wait_until_bob_is_ready() -> None:
     generator = filled(starts=ONE_GAME, replay_fraction=1.0, replay_from_reset=True)
-    goals, yes = np.tile(OLD_GOAL, (200, 1)), np.ones(200, dtype=np.bool_)
-    record(generator, make_records(goals, from_reset=yes, replayed=yes))
+    yes = np.ones(200, dtype=np.bool_)
+    begun = {"start_position": np.tile(ONE_GAME["start_position"], (200, 1)), "from_reset": yes, "replayed": yes}
+    goals = np.tile(OLD_GOAL, (200, 1))
+    record(generator, make_records(goals, **begun))
     assert choose(generator, [VALID] * 500).from_reset.mean() < 0.6  # both kinds hopeless: only the floor speaks
-    record(generator, make_records(goals, from_reset=yes, replayed=yes, solved=np.arange(200) < 150))
-    assert choose(generator, [VALID] * 500).from_reset.mean() > 0.8
+    record(generator, make_records(goals, **begun, solved=np.arange(200) < 150))
+    assert choose(generator, [VALID] * 500).from_reset.mean() > 0.75  # 0.19 of 0.19 + 0.04, with the floor
 
 
 def test_a_start_next_to_the_goal_is_no_task() -> None:
-    position = np.tile(OLD_GOAL, (8, 1)) + np.array([0.03, 0.03, 0.0])
-    near = {"start_state": np.ones((8, STATE_SIZE)), "start_position": position}
+    near = make_starts(make_states(8, mark=GAME), np.add(OLD_GOAL, (0.03, 0.03, 0.0)))
     choice = choose(filled(starts=near, replay_fraction=1.0, replay_from_reset=True), [VALID] * 8)
-    assert (choice.start_state == 7.0).all()
+    assert (choice.start_state[:, 0] == OLD).all()
     assert not choice.from_reset.any()
 
 
@@ -167,14 +180,16 @@ def test_no_goal_in_the_air_from_a_blocked_reset() -> None:
         parse_config({**settings, "game": {"blocked_gripper_fraction": 0.2}}, where="t"), SOME_BLOCKED
     )
     goals = np.tile([[0.0, 0.1, 0.025], [0.0, 0.1, 0.2]], (40, 1))
-    blocked_start = [float(column == BLOCKED) for column in range(STATE_SIZE)]
-    starts = starts_of(*[blocked_start, [0.0] * STATE_SIZE] * 200)
-    record(generator, make_records(goals, start_state=np.zeros((80, STATE_SIZE))), starts)  # no goal's own is blocked
-    choice = choose(generator, [VALID] * 400)
+    record(generator, make_records(goals, solved=np.arange(80) < 40))  # no goal's own start is blocked
+    games = make_states(400, SOME_BLOCKED, mark=GAME, blocked=np.arange(400) % 2 == 0)
+    record(generator, only_starts(make_starts(games)))
+    choice = choose(generator, [VALID] * 2000)
     blocked, in_air = choice.start_state[:, BLOCKED] == 1.0, choice.goal[:, 2] > 0.1
     assert choice.from_reset[blocked].all()
-    assert 0.1 < (blocked & ~in_air).mean() < 0.5
-    assert (~blocked & in_air).mean() > 0.1
+    # Bob solves half of all, and is untried where he is blocked. So all count alike: 40 goals on the table and 40 in
+    # the air from their own starts, 20 of either from free games, 20 on the table from blocked ones.
+    assert (blocked & ~in_air).mean() == pytest.approx(20 / 140, abs=0.05)
+    assert (~blocked & in_air).mean() == pytest.approx(60 / 140, abs=0.05)
     assert not (blocked & in_air).any()
 
 
@@ -182,19 +197,30 @@ def test_blocked_tasks_are_counted_apart() -> None:
     config = parse_config({"game": {"blocked_gripper_fraction": 0.2}}, where="test")
     generator = TaskGenerator(config, SOME_BLOCKED)
     blocked = np.arange(40) % 4 == 0
-    state = np.zeros((40, STATE_SIZE))
-    state[:, BLOCKED] = blocked
-    records = make_records(
-        np.tile(OLD_GOAL, (40, 1)), start_state=state, from_reset=np.ones(40, dtype=np.bool_), solved=~blocked
-    )
-    metrics = record(generator, records)
+    states = make_states(40, SOME_BLOCKED, blocked=blocked)
+    metrics = record(generator, make_records(np.tile(OLD_GOAL, (40, 1)), start_state=states, solved=~blocked))
     assert metrics["bob/success_rate_blocked"] == 0.0
     assert metrics["bob/success_rate"] == 0.75
     assert metrics["alice/valid_fraction_blocked"] == 1.0
-    rates = np.unique(generator.from_reset.learnability())  # of no tries, of 10 failures, of 30 successes
+    rates = np.unique(generator.difficulty.learnability())  # of no tries, of 10 failures, of 30 successes
     rates_of = 1 / (remembered(30) + 2), 1 / (remembered(10) + 2), 1 / 2
     expected = [p * (1 - p) for p in rates_of]
     assert rates == pytest.approx(expected)
+
+
+def test_the_same_goal_is_another_task_once_the_object_is_in_the_hand() -> None:
+    """Bob always fails it from the table, and solves half of his tries from the hand."""
+    generator = TaskGenerator(config(replay_fraction=1.0), FREE)
+    held = np.arange(200) % 2 == 0
+    states = make_states(200, held=held, mark=np.where(held, HELD, OLD))
+    record(generator, make_records(np.tile(OLD_GOAL, (200, 1)), start_state=states, solved=np.arange(200) % 4 == 0))
+    bins = np.flatnonzero(generator.difficulty.num_tries)
+    assert bins.tolist() == [1, NUM_TASK_BINS + 1]  # on the table, 10 cm away
+    rate = 1 / (remembered(100) + 2)
+    np.testing.assert_allclose(generator.difficulty.success_rate()[bins], [rate, 1 / 2], rtol=1e-12)
+    failed, half = rate * (1 - rate) + LEARNABILITY_FLOOR, 0.25 + LEARNABILITY_FLOOR
+    share = np.mean(choose(generator, [VALID] * 4000).start_state[:, 0] == HELD)
+    assert share == pytest.approx(half / (half + failed), abs=0.02)
 
 
 def test_a_past_bob_plays_no_replayed_goals() -> None:
@@ -210,11 +236,12 @@ def test_goals_that_nobody_proposed(source: str) -> None:
     """From a game's start or from where some world is now, and never where nothing has to be done."""
     settings = {"goal_source": source, "replay_invalid": True, "replay_from_reset": True}
     generator = TaskGenerator(config(**settings), FREE)
-    record(generator, make_records(np.tile(OLD_GOAL, (4, 1))), ONE_GAME)
+    record(generator, make_records(np.tile(OLD_GOAL, (4, 1))))
+    record(generator, only_starts(ONE_GAME))
     choice = choose(generator, [OUTSIDE] * 4000)
     assert choice.replayed.all()
     assert choice.played.all()
-    assert (choice.start_state == 1.0).all()  # of a game, and of every world
+    assert (choice.start_state[:, 0] == np.where(choice.from_reset, GAME, WORLD)).all()
     assert 0.4 < choice.from_reset.mean() < 0.6
     x, y, z = choice.goal.T
     share = {"table": 1.0}.get(source, 0.3)
@@ -227,23 +254,35 @@ def test_goals_that_nobody_proposed(source: str) -> None:
     assert (np.linalg.norm(choice.goal - choice.start_position, axis=1) > 0.05).all()
 
 
-def test_learnable_goals_are_drawn_by_learnability() -> None:
-    """Bob always solves goals in the cells with x below -2.5 cm, 20 of 35 cm; of the others nothing is known."""
-    cells = TaskGenerator(config(), FREE).cells.centers()
-    solved = np.repeat(cells[cells[:, 0] < -0.025], 100, axis=0)
+def everywhere(records: GoalRecords, generator: TaskGenerator) -> None:
+    """Tell a generator of a round in which an object was in every cell."""
+    summary = summary_of(records, generator.cells, generator.tasks)
+    generator.record(replace(summary, reached=np.ones(len(generator.cells), dtype=np.int64)))
+
+
+@pytest.mark.parametrize("source", ["uniform", "learnable", "reached"])
+def test_new_goals_are_drawn_by_learnability(source: str) -> None:
+    """Bob always solves goals more than 20 cm above the table; of others nothing is known.
+
+    Of mixed goals 0.7 are anywhere from 2.5 to 35 cm, so 0.7 * 125 / 325 are as high as that. Of all goals 2.4 % are no
+    tasks: within 5 cm of the object are 6.4 % of those on the table, and 0.7 % of the rest.
+    """
+    generator = TaskGenerator(config(goal_source=source, replay_invalid=True), FREE)
+    solved = np.repeat([(0.0, 0.0, 0.25), (0.0, 0.0, 0.34)], 100, axis=0)  # up to 30 cm away, and further
+    everywhere(make_records(solved, solved=np.ones(200, dtype=np.bool_)), generator)
     known = (remembered(100) + 1) / (remembered(100) + 2) ** 2
-    for source, (left, right) in {"uniform": (1.0, 1.0), "learnable": (known + 0.01, 0.25 + 0.01)}.items():
-        generator = TaskGenerator(config(goal_source=source, replay_invalid=True), FREE)
-        record(generator, make_records(solved, solved=np.ones(len(solved), dtype=np.bool_)))
-        goal = choose(generator, [OUTSIDE] * 4000).goal
-        share = 20 * left / (20 * left + 15 * right)
-        assert np.mean(goal[:, 0] < -0.025) == pytest.approx(share, abs=0.04), source
+    high, other = (1.0, 1.0) if source == "uniform" else (known + LEARNABILITY_FLOOR, 0.25 + LEARNABILITY_FLOOR)
+    num_high = 0.7 * 125 / 325
+    share = num_high * high / (num_high * high + (1.0 - num_high - 0.024) * other)
+    goal = choose(generator, [OUTSIDE] * 4000).goal
+    assert np.mean(goal[:, 2] > 0.225) == pytest.approx(share, abs=0.03)  # 0.276, or 0.057
 
 
 def test_reached_goals_are_drawn_where_an_object_was_and_beside() -> None:
     generator = TaskGenerator(config(goal_source="reached", replay_invalid=True, replay_from_reset=True), FREE)
     assert not choose(generator, [OUTSIDE] * 40).replayed.any()  # nothing was reached yet
-    record(generator, make_records([(0.1, 0.1, 0.2)]), ONE_GAME)
+    record(generator, make_records([(0.1, 0.1, 0.2)]))
+    record(generator, only_starts(ONE_GAME))
     choice = choose(generator, [OUTSIDE] * 400)
     assert choice.replayed.all()
     goals = np.concatenate([choose(generator, [OUTSIDE] * 400, seed=seed).goal for seed in range(20)])
@@ -252,23 +291,64 @@ def test_reached_goals_are_drawn_where_an_object_was_and_beside() -> None:
     assert len(drawn) == 6  # at the workspace's edge
 
 
-def test_reached_goals_are_drawn_by_learnability() -> None:
-    """Of six cells that are near what was reached Bob always solves the one in the middle."""
-    generator = TaskGenerator(config(goal_source="reached", replay_invalid=True), FREE)
-    middle = (0.1, 0.1, 0.2)
-    record(generator, make_records([middle] * 100, solved=np.ones(100, dtype=np.bool_)), ONE_GAME)
-    goals = np.concatenate([choose(generator, [OUTSIDE] * 400, seed=seed).goal for seed in range(20)])
-    known, unknown = (remembered(100) + 1) / (remembered(100) + 2) ** 2 + 0.01, 0.25 + 0.01
-    share = np.mean(generator.cells.index(goals) == generator.cells.index(np.array([middle])))
-    assert share == pytest.approx(known / (known + 5 * unknown), rel=0.3)
+IN_HAND = (0.05, 0.0, 0.2)
+
+
+def practising(num_held: int) -> TaskGenerator:
+    """A generator that draws new goals in all cells; a game began, and as many rounds with the object in the hand."""
+    generator = TaskGenerator(config(goal_source="reached", replay_invalid=True, replay_from_reset=True), FREE)
+    everywhere(only_starts(ONE_GAME), generator)
+    states = make_states(num_held, mark=HELD + np.arange(num_held), held=True)
+    record(generator, only_starts(make_starts(states, IN_HAND), round_index=1))
+    return generator
+
+
+def test_half_of_the_tasks_that_begin_with_no_reset_begin_in_the_hand() -> None:
+    """All are untried, so equally learnable; as many as all of these together begin with a reset."""
+    choice = choose(practising(3), [OUTSIDE] * 4000)
+    mark, held = choice.start_state[:, 0], choice.start_state[:, 0] >= HELD
+    assert choice.from_reset.mean() == pytest.approx(1 / 2, abs=0.05)
+    assert held[~choice.from_reset].mean() == pytest.approx(1 / 2, abs=0.05)
+    assert set(mark[~choice.from_reset]) == {WORLD, HELD, HELD + 1, HELD + 2}
+    assert set(mark[choice.from_reset]) == {GAME}
+    assert (choice.start_position[held] == IN_HAND).all()
+    assert (choice.start_position[mark == WORLD] == (0.0, 0.0, 0.025)).all()
+    assert (np.linalg.norm(choice.goal - choice.start_position, axis=1) > 0.05).all()
+
+
+def test_nearly_all_tasks_begin_in_the_hand_where_bob_can_learn_from_these_alone() -> None:
+    learnability = np.zeros(2 * NUM_TASK_BINS)
+    learnability[NUM_TASK_BINS:] = 0.25
+    choice = choose(replace(practising(3).snapshot(), learnability=learnability), [OUTSIDE] * 4000)
+    held = choice.start_state[:, 0] >= HELD
+    # With the floor each of these weighs 0.26; as many from where worlds are, and twice as many from resets, 0.01.
+    assert held.mean() == pytest.approx(0.26 / 0.29, abs=0.02)
+    assert held[~choice.from_reset].mean() == pytest.approx(0.26 / 0.27, abs=0.02)
+
+
+def test_tasks_begin_where_worlds_are_while_no_object_was_ever_held() -> None:
+    choice = choose(practising(0), [OUTSIDE] * 4000)
+    assert choice.from_reset.mean() == pytest.approx(1 / 2, abs=0.05)
+    assert (choice.start_state[:, 0] == np.where(choice.from_reset, GAME, WORLD)).all()
+
+
+def test_starts_in_the_hand_are_kept_and_the_newest_of_them() -> None:
+    generator = practising(3)
+    kept = generator.snapshot().held_starts
+    assert kept["start_state"][:, 0].tolist() == [HELD, HELD + 1, HELD + 2]
+    assert kept["start_position"].tolist() == [list(IN_HAND)] * 3
+    assert generator.snapshot().starts["start_state"][:, 0].tolist() == [GAME]
+    newer = make_states(NUM_STARTS - 1, mark=100.0, held=True)
+    record(generator, only_starts(make_starts(newer), round_index=1))
+    marks = generator.snapshot().held_starts["start_state"][:, 0]
+    assert sorted(marks) == [HELD + 2] + [100.0] * (NUM_STARTS - 1)
 
 
 def test_no_drawn_goal_in_the_air_where_the_gripper_is_blocked() -> None:
     settings = {"goal_source": "uniform", "replay_invalid": True}
     tree = {"generator": settings, "game": {"blocked_gripper_fraction": 0.2}}
     snapshot = TaskGenerator(parse_config(tree, where="t"), SOME_BLOCKED).snapshot()
-    state = np.zeros((400, STATE_SIZE))
-    state[::2, BLOCKED] = 1.0
+    state = make_states(400, SOME_BLOCKED, blocked=np.arange(400) % 2 == 0)
     index, verdict = np.zeros(400, dtype=np.int64), np.full(400, OUTSIDE, dtype=np.int8)
     place = np.tile([0.0, 0.0, 0.025], (400, 1))
     choice = snapshot.choose_goals(all_current(400), state, place, index, place, verdict, np.random.default_rng(0))
@@ -280,38 +360,25 @@ def test_no_drawn_goal_in_the_air_where_the_gripper_is_blocked() -> None:
 
 def test_choice_does_not_alias_its_inputs() -> None:
     generator = filled(replay_fraction=1.0)
-    start_state, position = np.ones((1, STATE_SIZE)), np.zeros((1, 3))
+    start_state, position = make_states(1, mark=WORLD), np.zeros((1, 3))
     verdict = np.zeros(1, dtype=np.int8)
     index = np.zeros(1, dtype=np.int64)
     generator.snapshot().choose_goals(
         all_current(1), start_state, position, index, position, verdict, np.random.default_rng(0)
     )
-    assert start_state.tolist() == [[1.0] * STATE_SIZE]
+    assert start_state.tolist() == make_states(1, mark=WORLD).tolist()
     assert position.tolist() == [[0.0] * 3]
 
 
 def test_replay_prefers_learnable_goals() -> None:
     generator = TaskGenerator(config(replay_fraction=1.0), FREE)
-    solved_always, solved_half = (0.1, 0.1, 0.025), (-0.1, -0.1, 0.025)
+    solved_always, solved_half = (0.1, 0.1, 0.025), (-0.2, -0.1, 0.025)  # 14 and 22 cm away
     goals = [solved_always] * 100 + [solved_half] * 100
     record(generator, make_records(goals, solved=[True] * 100 + [True, False] * 50))
     goal = choose(generator, [VALID] * 4000).goal
     # Each with the floor of 0.01 on top of p (1 - p).
     easy, hard = (remembered(100) + 1) / (remembered(100) + 2) ** 2 + 0.01, 0.25 + 0.01
     assert np.mean(goal[:, 0] > 0) == pytest.approx(easy / (easy + hard), abs=0.015)
-
-
-def test_replay_over_cells_does_not_forget_what_alice_has_left() -> None:
-    left, crowded = (-0.2, 0.0, 0.325), [(0.1, y, 0.025) for y in (-0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15)]
-    for over_cells, share in ((True, 1 / 2), (False, 0.0)):  # the only goal in the air, beside seven on the table
-        generator = TaskGenerator(config(replay_fraction=1.0, replay_over_cells=over_cells), FREE)
-        record(generator, make_records([left] * 2, solved=[True, False]))
-        for _ in range(5):
-            record(generator, make_records(crowded * 200, solved=[True] * 700 + [False] * 700))
-        record(generator, make_records([left] * 200, solved=[True, False] * 100, replayed=[True] * 200))
-        goal = choose(generator, [VALID] * 4000).goal  # what Bob can learn is alike everywhere, about 1/2
-        assert np.mean(goal[:, 0] == left[0]) == pytest.approx(share, abs=0.03)
-        assert np.mean(goal[:, 1] == crowded[0][1]) == pytest.approx((1 - share) / 7, abs=0.02)
 
 
 def test_record_separates_who_learns_what() -> None:
@@ -354,21 +421,30 @@ def test_an_iteration_without_any_goal() -> None:
     assert all(np.isfinite(value) for value in metrics.values())
 
 
-def test_stops_on_current_players_own_goals_only() -> None:
-    goals = np.tile(OLD_GOAL, (100, 1))
-    past, none = np.ones(100, dtype=np.bool_), np.zeros(100, dtype=np.bool_)
-    for overrides, expected in (
-        ({"solved": past}, True),
-        ({"solved": none}, False),
-        ({"solved": past, "replayed": past}, False),
-        ({"solved": past, "bob_past": past}, False),
-        ({"solved": past, "alice_past": past}, False),
-    ):
-        generator = TaskGenerator(config(novelty_window=2), FREE)
-        for _ in range(3):
-            assert not generator.should_stop()
-            record(generator, make_records(goals, **overrides))
-        assert generator.should_stop() is expected, overrides
+YES, NO = np.ones(100, dtype=np.bool_), np.zeros(100, dtype=np.bool_)
+FIRST_HALF = np.arange(100) < 50
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "expected"),
+    [
+        ({"solved": YES}, True),
+        ({"solved": NO}, False),
+        ({"solved": YES, "replayed": ~FIRST_HALF}, True),
+        ({"solved": FIRST_HALF, "replayed": ~FIRST_HALF}, False),  # all of Alice's, none of what he practises
+        ({"solved": ~FIRST_HALF, "replayed": ~FIRST_HALF}, False),
+        ({"solved": FIRST_HALF, "replayed": ~FIRST_HALF, "from_reset": ~FIRST_HALF}, False),
+        ({"solved": YES, "alice_past": FIRST_HALF}, True),
+        ({"solved": YES, "bob_past": YES}, False),  # nothing was tried
+        ({"solved": FIRST_HALF, "bob_past": FIRST_HALF}, False),
+    ],
+)
+def test_a_run_is_over_once_bob_solves_all_that_he_plays(outcomes: dict[str, Any], expected: bool) -> None:
+    generator = TaskGenerator(config(novelty_window=2), FREE)
+    for _ in range(3):
+        assert not generator.should_stop()
+        record(generator, make_records(np.tile(OLD_GOAL, (100, 1)), **outcomes))
+    assert generator.should_stop() is expected
 
 
 def test_opponents_are_due_every_interval() -> None:
@@ -391,13 +467,16 @@ def test_a_snapshot_is_a_copy() -> None:
     assert not all(np.array_equal(array, before[name]) for name, array in generator.snapshot().state().items())
 
 
-def test_a_choice_writes_to_nothing_and_draws_the_same_again() -> None:
+@pytest.mark.parametrize("source", ["alice", "reached"])
+def test_a_choice_writes_to_nothing_and_draws_the_same_again(source: str) -> None:
     """Snapshots of other processes are read-only."""
-    generator = filled(starts=ONE_GAME, replay_fraction=0.5, replay_from_reset=True)
+    settings: dict[str, Any] = {"goal_source": source, "replay_fraction": 0.5, "replay_from_reset": True}
+    generator = filled(starts=ONE_GAME, **settings)
+    record(generator, only_starts(make_starts(make_states(2, mark=HELD, held=True), IN_HAND), round_index=1))
     state = generator.snapshot().state()
     for array in state.values():
         array.flags.writeable = False
-    snapshot = TaskGenerator(config(replay_fraction=0.5, replay_from_reset=True), FREE).snapshot().with_state(state)
+    snapshot = TaskGenerator(config(**settings), FREE).snapshot().with_state(state)
     first, again, whole = (
         choose(snapshot, [VALID] * 40),
         choose(snapshot, [VALID] * 40),
@@ -405,13 +484,17 @@ def test_a_choice_writes_to_nothing_and_draws_the_same_again() -> None:
     )
     assert 0 < first.replayed.sum() < 40
     assert first.from_reset.any()
+    assert (first.start_state[:, 0] == HELD).any() == (source == "reached")
     for name in GoalChoice.__slots__:
         assert np.array_equal(getattr(first, name), getattr(again, name))
         assert np.array_equal(getattr(first, name), getattr(whole, name))
 
 
 def play(generator: TaskGenerator, rng: np.random.Generator, iterations: range) -> list[Any]:
-    """Run the verbs in call order on made-up proposals; everything that came out."""
+    """Run the verbs in call order on made-up proposals; everything that came out.
+
+    In one state of four both contacts are above 0.
+    """
     outcomes: list[Any] = []
     lower, upper = np.array([-0.2, -0.15, 0.0]), np.array([0.1, 0.15, 0.3])
     num = 20
@@ -429,22 +512,20 @@ def play(generator: TaskGenerator, rng: np.random.Generator, iterations: range) 
             solved=choice.played & (rng.random(num) < 0.5),
             alice_past=plan.alice_past,
             bob_past=plan.bob_past,
+            round_index=index,
         )
-        outcomes.append(
-            (
-                plan.alice_opponent.tolist(),
-                choice.goal.tolist(),
-                record(generator, records, starts_of(list(start_state[0]))),
-            )
-        )
+        metrics = record(generator, records, {"start_state": start_state, "start_position": start})
+        outcomes.append((plan.alice_opponent.tolist(), choice.goal.tolist(), choice.start_state.tolist(), metrics))
         if iteration % 3 == 0:
             generator.add_opponents(iteration, {"a/w": rng.normal(size=3)}, {"b.w": rng.normal(size=(2, 2))})
         outcomes.append(generator.should_stop())
     return outcomes
 
 
-def test_exact_resume_through_a_file(tmp_path: Path) -> None:
+@pytest.mark.parametrize("source", ["alice", "reached"])
+def test_exact_resume_through_a_file(tmp_path: Path, source: str) -> None:
     settings = config(
+        goal_source=source,
         replay_fraction=0.3,
         replay_invalid=True,
         replay_from_reset=True,
@@ -460,6 +541,7 @@ def test_exact_resume_through_a_file(tmp_path: Path) -> None:
     resumed_rng.bit_generator.state = rng.bit_generator.state
     with np.load(tmp_path / "state.npz", allow_pickle=False) as state:
         resumed.load_state({name: state[name] for name in state.files})
+    assert len(resumed.held_starts) == len(generator.held_starts) > 0
     assert play(resumed, resumed_rng, range(12, 24)) == play(generator, rng, range(12, 24))
     state, again = generator.state(), resumed.state()
     assert list(state) == list(again)

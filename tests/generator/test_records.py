@@ -10,7 +10,6 @@ import pytest
 
 from service.base.types import Metrics
 from service.config import parse_config
-from service.envs.state_layout import StateLayout
 from service.generator.bins import NUM_TASK_BINS, GoalCells, TaskBins
 from service.generator.generator import TaskGenerator
 from service.generator.records import (
@@ -26,13 +25,12 @@ from service.generator.records import (
     sampled_goals,
     summarize,
 )
+from service.generator.ring import Rows
 from service.generator.validity import Verdict
-from tests.generator.outcomes import make_records, starts_of, summary_of
+from tests.generator.outcomes import SOME_BLOCKED, make_records, make_starts, make_states, summary_of
 
 CONFIG = parse_config({"game": {"blocked_gripper_fraction": 0.2}}, where="test")
-LAYOUT = StateLayout(positions={}, velocities={}, measured={}, kept={"gripper_blocked": 1, "object_mass": 2})
-CELLS, TASKS = GoalCells(CONFIG.world, CONFIG.generator.cell_size_m), TaskBins(CONFIG, LAYOUT)
-BLOCKED = LAYOUT["gripper_blocked"].start
+CELLS, TASKS = GoalCells(CONFIG.world, CONFIG.generator.cell_size_m), TaskBins(CONFIG, SOME_BLOCKED)
 REST = 0.025
 
 
@@ -175,13 +173,10 @@ def counted(counts: np.ndarray) -> dict[int, int]:
 
 def test_summary_of_six_worlds_by_hand() -> None:
     near, far, other = (-0.1, 0.0, 0.025), (0.1, 0.0, 0.225), (-0.2, 0.1, 0.025)
-    state = np.zeros((6, LAYOUT.size))
-    state[3, BLOCKED] = 1.0
     records = make_records(
         [near, near, far, other, far, (0.5, 0.0, 0.0)],
         goal=[near, near, far, near, other, near],
-        start_state=state,
-        start_position=[(0.0, 0.0, 0.025)] * 6,
+        start_state=make_states(6, SOME_BLOCKED, blocked=np.arange(6) == 3),
         # Solved as proposed; a past Bob's; diverged; from a reset, blocked; replayed from its own start; from a reset.
         verdict=np.array([0, 0, 0, 0, 0, Verdict.OUTSIDE], dtype=np.int8),
         replayed=[False, False, False, True, True, True],
@@ -190,15 +185,14 @@ def test_summary_of_six_worlds_by_hand() -> None:
         solved=[True, True, False, False, True, True],
         bob_past=[False, True, False, False, False, False],
     )
-    summary = summary_of(records, CELLS, TASKS, starts_of([1.0] * 4, [2.0] * 4))
+    summary = summary_of(records, CELLS, TASKS)
     assert counted(summary.proposed) == dict(zip(at(near, far, other), (2, 2, 1), strict=True))
     assert counted(summary.tries) == dict.fromkeys(at(near, other), 1)
     assert counted(summary.successes) == dict.fromkeys(at(near, other), 1)
-    bin_of_near = 1  # on the table, 0.10 m away
-    assert counted(summary.reset_tries) == {bin_of_near: 2, bin_of_near + NUM_TASK_BINS: 1}
-    assert counted(summary.reset_successes) == {bin_of_near: 2}
+    bin_of_near, bin_of_other = 1, 3  # on the table, 0.10 m and 0.22 m away
+    assert counted(summary.task_tries) == {bin_of_near: 2, bin_of_other: 1, bin_of_near + 2 * NUM_TASK_BINS: 1}
+    assert counted(summary.task_successes) == {bin_of_near: 2, bin_of_other: 1}
     assert summary.goals["goal"].tolist() == [list(near), list(near)]
-    assert summary.starts["start_state"][:, 0].tolist() == [1.0, 2.0]
     assert summary.shown.shape == (1, 7)
     assert summary.metrics["bob/success_rate"] == (1, 1.0)
     assert summary.metrics["bob/success_rate_from_reset"] == (3, 2.0)
@@ -207,18 +201,69 @@ def test_summary_of_six_worlds_by_hand() -> None:
     assert summary.heights.sum() == 5
 
 
+def test_every_try_of_the_current_bob_counts_as_a_task() -> None:
+    """Of the same goal as proposed, replayed, and replayed from a reset; from the hand it is another one."""
+    goal = (-0.1, 0.0, 0.025)
+    records = make_records(
+        [goal] * 6,
+        start_state=make_states(6, SOME_BLOCKED, held=np.arange(6) >= 4),
+        replayed=[False, True, True, False, False, True],
+        from_reset=[False, False, True, False, False, False],
+        played=[True, True, True, False, True, True],
+        solved=[True, False, True, False, False, True],
+    )
+    summary = summary_of(records, CELLS, TASKS)
+    assert counted(summary.task_tries) == {1: 3, 1 + NUM_TASK_BINS: 2}
+    assert counted(summary.task_successes) == {1: 2, 1 + NUM_TASK_BINS: 1}
+    assert counted(summary.tries) == dict.fromkeys(at(goal), 4)  # cells leave out what was replayed from a reset
+
+
+def marks(rows: Rows) -> list[float]:
+    """The marks of starts."""
+    return rows["start_state"][:, 0].tolist()
+
+
+def test_starts_are_of_games_and_held_starts_of_later_rounds() -> None:
+    states = make_states(7, SOME_BLOCKED, mark=np.arange(7.0))
+    # Held: in the first round of a game, the second, the third; one finger touches; a blocked gripper; free twice.
+    states[[0, 1, 2, 4], SOME_BLOCKED["contacts"]] = 1.0
+    states[3, SOME_BLOCKED["contacts"].start] = 1.0
+    states[4, SOME_BLOCKED["gripper_blocked"]] = 1.0
+    starts = {"start_state": states, "start_position": np.arange(21.0).reshape(7, 3)}
+    # Bob's turns began elsewhere, all in the hand.
+    elsewhere = make_states(7, SOME_BLOCKED, mark=-1.0, held=True)
+    records = make_records([(0.1, 0.0, 0.025)] * 7, start_state=elsewhere, round_index=[0, 1, 2, 1, 1, 0, 1])
+    summary = summary_of(records, CELLS, TASKS, starts)
+    assert marks(summary.starts) == [0.0, 5.0]
+    assert marks(summary.held_starts) == [1.0, 2.0]
+    assert summary.held_starts["start_position"].tolist() == [[3.0, 4.0, 5.0], [6.0, 7.0, 8.0]]
+
+
+def test_of_both_kinds_of_starts_so_many_are_kept() -> None:
+    states = make_states(100, SOME_BLOCKED, mark=np.arange(100.0), held=True)
+    records = make_records([(0.1, 0.0, 0.025)] * 100, round_index=np.arange(100) % 2)
+    summary = summary_of(records, CELLS, TASKS, make_starts(states), max_starts=20)
+    for kept, odd in ((summary.starts, 0), (summary.held_starts, 1)):
+        assert len(set(marks(kept))) == 20
+        assert set(np.array(marks(kept)) % 2) == {odd}
+        assert marks(kept) == sorted(marks(kept))
+    several = summary_of(records, CELLS, TASKS, make_starts(states), max_starts=50)
+    assert marks(several.starts) + marks(several.held_starts) == [*range(0, 100, 2), *range(1, 100, 2)]
+
+
 def random_records(rng: np.random.Generator, num: int) -> GoalRecords:
     """Whatever may happen, in no order."""
     flags = {name: rng.random(num) < 0.4 for name in ("replayed", "from_reset", "solved", "alice_past")}
     return make_records(
         rng.uniform([-0.2, -0.15, 0.0], [0.1, 0.15, 0.3], size=(num, 3)),
         goal=rng.uniform([-0.2, -0.15, 0.0], [0.1, 0.15, 0.3], size=(num, 3)),
-        start_state=rng.integers(2, size=(num, LAYOUT.size)).astype(float),
+        start_state=rng.integers(2, size=(num, SOME_BLOCKED.size)).astype(float),
         start_position=rng.uniform(-0.1, 0.1, size=(num, 3)),
         verdict=rng.integers(4, size=num).astype(np.int8),
         played=rng.random(num) < 0.8,
         bob_past=~flags["alice_past"] & (rng.random(num) < 0.2),
         num_bob_steps=rng.integers(1, 40, size=num),
+        round_index=rng.integers(3, size=num),
         **flags,
     )
 
@@ -241,42 +286,43 @@ def assert_same(one: GoalSummary, other: GoalSummary) -> None:
 
 def test_many_actors_together_tell_what_one_does() -> None:
     records = random_records(np.random.default_rng(1), 300)
-    whole = summary_of(records, CELLS, TASKS, starts_of([1.0] * 4, [2.0] * 4))
-    joined = join_summaries(
-        [
-            summary_of(part(records, slice(0, 20)), CELLS, TASKS, starts_of([1.0] * 4)),
-            summary_of(part(records, slice(20, 21)), CELLS, TASKS),
-            summary_of(part(records, slice(21, 300)), CELLS, TASKS, starts_of([2.0] * 4)),
-        ]
-    )
+    whole = summary_of(records, CELLS, TASKS)
+    rounds = slice(0, 20), slice(20, 21), slice(21, 300)
+    joined = join_summaries([summary_of(part(records, rows), CELLS, TASKS) for rows in rounds])
+    assert min(len(rows["start_state"]) for rows in (whole.starts, whole.held_starts)) > 10
     assert [name for name, (num, _) in whole.metrics.items() if not num] == []
     assert_same(joined, whole)
     assert_same(join_summaries([whole]), whole)
-    generators = [TaskGenerator(CONFIG, LAYOUT) for _ in range(2)]
+    generators = [TaskGenerator(CONFIG, SOME_BLOCKED) for _ in range(2)]
     metrics = [generator.record(each) for generator, each in zip(generators, (whole, joined), strict=True)]
     assert metrics[0] == pytest.approx(metrics[1])
     assert [int(generator.grid.counts.num_tries.sum()) for generator in generators] == [int(whole.tries.sum())] * 2
+    assert [int(each.difficulty.num_tries.sum()) for each in generators] == [int(whole.task_tries.sum())] * 2
 
 
 def test_more_goals_than_their_places_are_sampled() -> None:
     num = 400
     records = make_records(np.linspace([-0.2, 0.0, 0.025], [0.1, 0.0, 0.025], num))
-    starts = starts_of(*([float(index)] * 4 for index in range(100)))
-    summary = summary_of(records, CELLS, TASKS, starts, max_goals=50, max_starts=20)
-    goals, kept = summary.goals["goal"][:, 0], summary.starts["start_state"][:, 0]
-    assert (len(set(goals)), len(set(kept))) == (50, 20)
+    summary = summary_of(records, CELLS, TASKS, max_goals=50)
+    goals = summary.goals["goal"][:, 0]
+    assert len(set(goals)) == 50
     assert set(goals) <= set(records.goal[:, 0])
     assert (np.diff(goals) > 0).all()
-    assert (np.diff(kept) > 0).all()
     assert abs(np.mean(goals) - (-0.05)) < 3 * 0.3 / np.sqrt(12 * 50)  # from everywhere
     assert summary.proposed.sum() == summary.tries.sum() == num  # sums leave nothing out
     assert len(summary.shown) == GOALS_PER_ITERATION
 
 
-def test_random_numbers_are_left_alone_where_nothing_is_left_out() -> None:
-    records, starts = make_records([(0.1, 0.0, 0.025)] * 5), starts_of([1.0] * 4)
-    for max_goals, untouched in ((5, True), (4, False)):
-        rng, same = np.random.default_rng(3), np.random.default_rng(3)
-        reached = CELLS.count(records.proposal)
-        summarize(records, starts, reached, CELLS, TASKS, max_goals=max_goals, max_starts=1, rng=rng)
-        assert (rng.bit_generator.state == same.bit_generator.state) is untouched
+@pytest.mark.parametrize(
+    ("max_goals", "max_starts", "untouched"), [(5, 3, True), (4, 3, False), (5, 2, False)], ids=str
+)
+def test_random_numbers_are_left_alone_where_nothing_is_left_out(
+    max_goals: int, max_starts: int, untouched: bool
+) -> None:
+    """Five goals, and three starts in the hand."""
+    records = make_records([(0.1, 0.0, 0.025)] * 5, round_index=[0, 0, 1, 1, 1])
+    starts = make_starts(make_states(5, SOME_BLOCKED, held=True))
+    rng, same = np.random.default_rng(3), np.random.default_rng(3)
+    reached = CELLS.count(records.proposal)
+    summarize(records, starts, reached, CELLS, TASKS, max_goals=max_goals, max_starts=max_starts, rng=rng)
+    assert (rng.bit_generator.state == same.bit_generator.state) is untouched
