@@ -278,6 +278,16 @@ def assert_fresh(game, worlds):
     assert ((states[:, 10:12] >= low) & (states[:, 10:12] <= high)).all()
 
 
+def test_the_starts_of_a_round_are_copies_of_where_all_worlds_are():
+    game = make_game(make_config(5, game={"num_goals": 2}), STARTS)
+    for _ in range(2):
+        starts = game.round_starts()
+        records = play(game, Pusher()).records
+        assert np.array_equal(starts["start_state"], records.start_state)
+        assert np.array_equal(starts["start_position"], records.start_position)
+    assert len(set(records.round_index)) == 2
+
+
 def test_an_invalid_goal_ends_the_game():
     game = make_game(make_config(5), STARTS)
     play(game, Pusher())

@@ -79,6 +79,22 @@ def test_the_generator_hears_of_every_game_that_began(learned, make_actor, confi
     assert starts.std(axis=0)[:2].min() > 0.0
 
 
+def test_the_generator_hears_of_every_later_round_that_begins_in_the_hand(learned, make_actor):
+    weights, generator = learned
+    given, actor = (generator.generator.snapshot(), generator.generator.opponents), make_actor(1)
+    worlds, contacts = actor.game.worlds, actor.game.worlds.layout["contacts"]
+    actor.play(weights, *given)
+    states = worlds.states.copy()
+    states[:, contacts] = [(1.0, 1.0), (1.0, 0.0)] * (len(states) // 2)
+    worlds.restore(states)
+    rollout, goals, _ = actor.play(weights, *given)
+    later = rollout.records.round_index > 0
+    assert later[::2].any()
+    assert later[1::2].any()
+    assert np.array_equal(goals.held_starts["start_state"], states[::2][later[::2]])
+    assert np.array_equal(goals.starts["start_state"], states[~later])
+
+
 def test_many_rounds_of_an_iteration_share_the_places(learned, make_actor, config):
     weights, generator = learned
     given = generator.generator.snapshot(), generator.generator.opponents
