@@ -19,6 +19,8 @@ RECIPE = "recipe"
 SHIPPED = "the shipped recipe"
 _OF_ONE_RUN = ("name", "seed", "run.")
 """Keys that may differ between two runs of the same recipe."""
+_GONE = {"generator": {"replay_over_cells": False}}
+"""Keys that are gone and did something, with the values by which they did nothing."""
 
 
 def differences(recorded: Mapping[str, Any], other: Mapping[str, Any] | None = None) -> dict[str, tuple[Any, Any]]:
@@ -29,7 +31,7 @@ def differences(recorded: Mapping[str, Any], other: Mapping[str, Any] | None = N
         other: the same; None: the shipped recipe.
     """
     mine = _leaves(_tree(recorded))
-    others = _leaves(_tree(other) if other is not None else load_config(RECIPE_FILE).model_dump(mode="json"))
+    others = _leaves(_tree(other if other is not None else load_config(RECIPE_FILE).model_dump(mode="json")))
     return {
         key: (mine.get(key), others.get(key))
         for key in sorted({*mine, *others})
@@ -58,8 +60,9 @@ def check_words(path: Path, page: str, study: Mapping[str, Any]) -> None:
 
 
 def _tree(recorded: Mapping[str, Any]) -> dict[str, Any]:
-    """The recorded values of today's keys; those that are gone did nothing in what is compared."""
-    return _filled(SelfPlayConfig().model_dump(mode="json"), recorded)
+    """The recorded values of today's keys and of ``_GONE``; others that are gone did nothing in what is compared."""
+    today = SelfPlayConfig().model_dump(mode="json")
+    return _filled(today | {room: today[room] | keys for room, keys in _GONE.items()}, recorded)
 
 
 def _filled(defaults: Mapping[str, Any], recorded: Mapping[str, Any]) -> dict[str, Any]:

@@ -111,6 +111,11 @@ def test_which_recipe_a_time_to_skill_was_measured_with():
     )
 
 
+def test_an_option_that_is_gone_is_told_of_a_run_that_had_it_on():
+    for had, told in ((True, {"generator.replay_over_cells": (True, False)}), (False, {})):
+        assert differences(SHIPS | {"generator": SHIPS["generator"] | {"replay_over_cells": had}}) == told
+
+
 def test_the_digest_that_a_page_calls_the_champion_is_the_bundled_ones():
     digest = parameters_digest(service.load_primitives("panda-cube@champion", registry="no registry here").primitives)
     page = (DOCS / "results" / "pretraining.md").read_text()
