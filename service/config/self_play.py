@@ -98,8 +98,9 @@ class GeneratorConfig(FrozenModel):
         "alice",
         description="of the goals that Bob plays besides those that Alice has just proposed. alice: her earlier ones. "
         "reached: new ones in cells to which either player has brought the object in a game, and in cells beside "
-        "these, weighted by p (1 - p) of their cells. Controls: uniform, drawn as those of an evaluation; table, "
-        "anywhere on it; learnable, uniform goals weighted by p (1 - p) (SFL, Rutherford et al. 2024)",
+        "these, weighted by p (1 - p) of tasks like them. Controls: uniform, drawn as those of an evaluation; table, "
+        "anywhere on it; learnable, uniform goals weighted by p (1 - p) (SFL, Rutherford et al. 2024). All but alice's "
+        "begin where worlds are now, and every second with the object in the hand once there are such starts",
     )
     replay_fraction: float = Field(
         0.0,
@@ -115,7 +116,9 @@ class GeneratorConfig(FrozenModel):
     replay_buffer_size: int = Field(4096, ge=1)
     cell_size_m: float = Field(0.05, gt=0.0, description="edge of a goal cell of the difficulty grid")
     novelty_window: int = Field(50, ge=1, description="iterations without a new cell before the run may stop")
-    stop_success_rate: float = Field(0.95, gt=0.0, le=1.0)
+    stop_success_rate: float = Field(
+        0.95, gt=0.0, le=1.0, description="of all that Bob plays in that window, the share that he has to solve"
+    )
 
 
 class MLPConfig(FrozenModel):

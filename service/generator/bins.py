@@ -80,7 +80,7 @@ class GoalCells:
 class TaskBins:
     """Bins of tasks, a task being a goal and a start, by what makes them hard for Bob.
 
-    They are the goal's height, its distance from the object's start, and the gripper: it is free, or it holds the object
+    They are the goal's height, its distance from the object's start, and the gripper: it is free, it holds the object
     already, or, where a run blocks some grippers, it is blocked.
 
     Args:

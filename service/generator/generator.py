@@ -18,13 +18,13 @@ from service.generator.ring import Ring
 from service.generator.snapshot import GeneratorSnapshot
 
 NUM_STARTS = 1024
-"""Starts of games kept for ``replay_from_reset``."""
+"""Starts of either kind that are kept: of games, for ``replay_from_reset``, and in the hand."""
 MIN_NUM_GOALS = 100
 """Goals the window must hold before Bob's success rate says anything: its 95 % interval is then below +-10 points."""
 
 
 class StopCriterion:
-    """The paper's stop criterion over a window of iterations: Alice finds nothing new, and Bob solves all."""
+    """The paper's stop criterion over a window of iterations: Alice finds nothing new, and Bob solves all he plays."""
 
     def __init__(self, config: GeneratorConfig) -> None:
         self._stop_success_rate = config.stop_success_rate
@@ -146,7 +146,7 @@ class TaskGenerator:
             self.opponents = self.opponents.joined_by(alice, bob, iteration, config.opponent_pool_size)
 
     def should_stop(self) -> bool:
-        """Whether, over ``novelty_window`` iterations, Alice found no new goal cell and Bob solved her goals."""
+        """Whether, over ``novelty_window`` iterations, Alice found no new goal cell and Bob solved all he played."""
         return self._stop.should_stop()
 
     def state(self) -> Arrays:
