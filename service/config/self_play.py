@@ -189,6 +189,12 @@ class PPOConfig(FrozenModel):
         description="first updates of a run in which the value network learns and the policy stays: one that begins "
         "from a trained policy (--from) would else be led by a network that knows nothing",
     )
+    settle_after_updates: int | None = Field(
+        None,
+        ge=1,
+        description="from this update N on the learning rate is at most its upper bound times N over the number of "
+        "updates: small enough for the average of a policy to settle. None: it stays",
+    )
 
 
 class BobPPOConfig(PPOConfig):

@@ -188,8 +188,7 @@ class Learner:
             # A few turns that are cycled through many times would count for more than all others together.
             share = _num(imitated) / max(how.rows_per_sample * counted["num_alice_samples"], 1.0)
             how = how.model_copy(update={"weight": how.weight * min(1.0, share)})
-        learns = self.version >= self.config.learner.alice.value_first_updates
-        metrics = ppo.update(self._alice, samples, imitated, how, self._rng, policy_learns=learns)
+        metrics = ppo.update(self._alice, samples, imitated, how, self._rng, version=self.version)
         return _prefixed("alice", metrics) | counted
 
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
@@ -201,11 +200,10 @@ class Learner:
             samples = reflect_at_random(samples, self._layouts, bob, self._rng)
         demonstrations = self._to_clone(DEMONSTRATIONS, [each.demonstrations for each in rollouts])
         metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + mirrors))
-        learns = self.version >= config.bob.value_first_updates
         how = config.abc
         if solved_share(rollouts) > how.mean_only_min_success:
             how = how.model_copy(update={"mean_only": True})
-        updated = ppo.update(bob, samples, demonstrations, how, self._rng, policy_learns=learns)
+        updated = ppo.update(bob, samples, demonstrations, how, self._rng, version=self.version)
         metrics |= _prefixed("bob", updated)
         rows = samples if samples is not None else demonstrations
         if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):

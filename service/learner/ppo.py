@@ -130,11 +130,11 @@ def update(
     how: CloningConfig,
     rng: np.random.Generator,
     *,
-    policy_learns: bool = True,
+    version: int = 0,
 ) -> Metrics:
     """Learn from samples, demonstrations or both; go back to the parameters before if that fails.
 
-    Without ``policy_learns`` the value network alone does.
+    In the first updates the value network alone may learn; ``version`` is the number of those before this one.
 
     An update fails when three minibatches were not finite, or when it moved the policy by ten times the target KL.
     The KL is exact, between the policies before and after, averaged over probes.
@@ -143,6 +143,7 @@ def update(
         Metrics without the player's prefix; one that there is nothing to measure on is left out.
     """
     metrics = {"learning_rate": player.optimizer.learning_rate, "non_finite_steps": 0.0, "rollbacks": 0.0}
+    policy_learns = version >= player.config.value_first_updates
     if not policy_learns:
         demonstrations = None
     rows = samples if samples is not None else demonstrations
@@ -158,7 +159,8 @@ def update(
     if failed:
         player.load_state(saved)
     if policy_learns:
-        player.optimizer.learning_rate = _adapted_learning_rate(player, math.inf if failed or stats.stopped else kl)
+        rate = _adapted_learning_rate(player, math.inf if failed or stats.stopped else kl)
+        player.optimizer.learning_rate = min(rate, _highest_learning_rate(player, version))
     if samples is not None:
         metrics["explained_variance"] = explained_variance(samples.value_target, samples.value)
     metrics |= {"non_finite_steps": float(stats.num_non_finite), "rollbacks": float(failed)}
@@ -348,6 +350,16 @@ def _adapted_learning_rate(player: Player, kl: float) -> float:
     if kl < 0.5 * player.config.target_kl:
         return min(player.optimizer.learning_rate * LEARNING_RATE_STEP, high)
     return player.optimizer.learning_rate
+
+
+def _highest_learning_rate(player: Player, version: int) -> float:
+    """The upper bound, and once a player is to settle less and less: as 1 over the number of updates.
+
+    With steps like these the average of where gradient steps come by goes to one point (Robbins and Monro 1951, Polyak
+    and Juditsky 1992); with steps of one length it wanders.
+    """
+    config, highest = player.config, player.config.learning_rate * LEARNING_RATE_BOUNDS[1]
+    return highest * min(1.0, (config.settle_after_updates or math.inf) / (version + 1))
 
 
 def _join(turns: Sequence[Turns], name: str) -> Array:
