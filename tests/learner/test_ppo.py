@@ -266,6 +266,26 @@ def test_learning_rate_follows_the_kl_within_bounds(target_kl, num_updates, mult
     assert player.optimizer.learning_rate == pytest.approx(CONFIG.learning_rate * multiple)
 
 
+@pytest.mark.parametrize(
+    ("version", "multiple"),
+    [(2, 2.0), (3, 2.0), (7, 1.0), (39, 0.2)],  # of updates 3, 4, 8, 40: twice the rate, times 4 / number at most
+)
+def test_a_player_that_settles_has_a_learning_rate_that_falls_with_the_number_of_updates(version, multiple):
+    player, rng = make_player(target_kl=1e3, num_epochs=1, settle_after_updates=4), np.random.default_rng(0)
+    for _ in range(2):  # so small a KL raises it to the bound
+        ppo.update(player, play(player, rng, num=32), None, ABC, np.random.default_rng(0), version=version)
+    assert player.optimizer.learning_rate == pytest.approx(CONFIG.learning_rate * multiple)
+
+
+def test_in_the_first_updates_the_value_network_alone_may_learn():
+    player = make_player(value_first_updates=2)
+    for version, moves in ((1, False), (2, True)):
+        before = player.policy.mean.item()
+        samples = play(player, np.random.default_rng(0))
+        ppo.update(player, samples, make_cloning(player), ABC, np.random.default_rng(0), version=version)
+        assert (player.policy.mean.item() != before) == moves
+
+
 def test_an_update_that_was_stopped_early_lowers_the_learning_rate():
     # However small its KL is at last: a step that leaves most samples unused was too long.
     player = make_player(target_kl=1e-9, num_epochs=1)
