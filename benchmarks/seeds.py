@@ -96,11 +96,9 @@ def main() -> int:
             raise TandemError(f"{given.json}: its seeds had other settings; name another file")
         if seed in {run["seed"] for run in result["runs"]}:
             continue
-        where, directory = (
-            machine(),
-            learn(config, given.runs / "registry", given.runs / f"{given.json.stem}-{seed}")[0],
-        )
-        run = {"seed": seed, "measured": measure(directory, config, at), "curve": curve(directory)}
+        where, path = machine(), given.runs / f"{given.json.stem}-{seed}"
+        directory, _ = learn(config, given.runs / "registry", path)
+        run: dict[str, Any] = {"seed": seed, "measured": measure(directory, config, at), "curve": curve(directory)}
         run |= {"git_commit": git_commit(), "machine": where}
         if given.json.exists():  # another process may have run another seed meanwhile
             result = json.loads(given.json.read_text(encoding="utf-8"))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 from benchmarks.record_run import ASKED, ASKED_RATES, ASKED_STEPS, TASKS
 from benchmarks.report.markdown import Row, duration, millions, percent, table
 from benchmarks.run_files import RANDOM, STAGES, Records, Run, binned, mean_share, steps_until, unthin
+from benchmarks.seeds import KINDS
 from service.config.self_play import SelfPlayConfig
 from service.registry.bundled import BUNDLED
 from service.registry.loading import load, parameters_digest
@@ -15,6 +17,8 @@ from service.registry.loading import load, parameters_digest
 NUM_BINS = 10
 """Equal parts of a run's env steps; rates are those of the last, distances and heights also those of the first."""
 CHAMPION = "panda-cube@champion"
+DIPS_FROM = 4e6
+"""Env steps from which on two evaluations in a row below what is asked for are a dip."""
 DIGITS = 12
 """Of a digest on a page, as in the table of tasks."""
 
@@ -61,6 +65,28 @@ def _judged(evaluations: Records) -> list[str]:
     rates = {row["goals"]: row["success_last"] for row in evaluations if row["policy"] != "idle"}
     cells = zip(TASKS, tasks_cells(evaluations), strict=True)
     return [f"**{cell}**" if cell and rates[task] < ASKED_RATES[task] else cell for task, cell in cells]
+
+
+def seeds_block(study: Mapping[str, Any]) -> str:
+    """What ``benchmarks.seeds`` recorded: a row for each seed, and how many there are of what is asked for."""
+    at = sorted({row["asked"] for run in study["runs"] for row in run["measured"]})
+    head = ("seed", *(f"{millions(asked)}: mixed, table, air, *Larger*" for asked in at), "dips")
+    rows, counts = [], []
+    for run in study["runs"]:
+        found = {row["asked"]: row for row in run["measured"]}
+        cells = [", ".join(f"{100 * found[a][kind]['last']:.1f}" for kind in KINDS) if a in found else "" for a in at]
+        rows.append((str(run["seed"]), *cells, str(num_dips(run["curve"]))))
+    for asked in at:
+        rates = [row["mixed"]["last"] for run in study["runs"] for row in run["measured"] if row["asked"] == asked]
+        counts.append(f"{sum(rate >= ASKED_RATES['mixed'] for rate in rates)} of {len(rates)} at {millions(asked)}")
+    words = f"At least {percent(ASKED_RATES['mixed'])} of mixed goals: {', '.join(counts)} env steps."
+    return f"{table(head, rows)}\n\n{words}"
+
+
+def num_dips(curve: Sequence[Mapping[str, float]]) -> int:
+    """Evaluations of mixed goals after ``DIPS_FROM`` that are below what is asked for, as the one before them."""
+    rates = [row["mixed"] for row in curve if row["env_steps"] >= DIPS_FROM]
+    return sum(max(pair) < ASKED_RATES["mixed"] for pair in pairwise(rates))
 
 
 def training_table(runs: Sequence[Run]) -> str:
