@@ -247,12 +247,12 @@ class ABCConfig(CloningConfig):
         description="also clone steps of Bob's failed turns, relabelled with where the object ended (Ghosh et al. "
         "2021); no more than there are of Alice's",
     )
-    mean_only_min_success: float = Field(
+    max_success: float = Field(
         1.0,
         ge=0.0,
         le=1.0,
-        description="clone the mean only in updates in which Bob solved more than this share of his turns: by then he "
-        "needs no noise to explore, and cloned noise outweighs what his own turns say of it",
+        description="clone only in updates in which Bob solved no more than this share of his turns. Later "
+        "demonstrations are what is left of failures: he stands still and dithers, and learns to from it",
     )
 
 

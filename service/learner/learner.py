@@ -200,10 +200,9 @@ class Learner:
             samples = reflect_at_random(samples, self._layouts, bob, self._rng)
         demonstrations = self._to_clone(DEMONSTRATIONS, [each.demonstrations for each in rollouts])
         metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + mirrors))
-        how = config.abc
-        if solved_share(rollouts) > how.mean_only_min_success:
-            how = how.model_copy(update={"mean_only": True})
-        updated = ppo.update(bob, samples, demonstrations, how, self._rng, version=self.version)
+        if solved_share(rollouts) > config.abc.max_success:
+            demonstrations = None
+        updated = ppo.update(bob, samples, demonstrations, config.abc, self._rng, version=self.version)
         metrics |= _prefixed("bob", updated)
         rows = samples if samples is not None else demonstrations
         if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):
