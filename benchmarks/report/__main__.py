@@ -30,7 +30,7 @@ FILES = ("env_throughput", "throughput", "world_speed", "deployed", "mutation", 
          "transfer", "transfer_champion")  # fmt: skip
 """Names of the recorded files of which there is one each."""
 PAGES = {
-    "results/pretraining.md": ("skill", "champion", "tasks", "curves", "curriculum", "coverage", "throughput"),
+    "results/pretraining.md": ("skill", "seeds", "champion", "tasks", "curves", "curriculum", "coverage", "throughput"),
     "results/deployed.md": ("checks",),
     "results/skills.md": ("coverage", "curves", "controls"),
     "results/comparison.md": ("rows", "longer", "below", "harder", "missing"),
@@ -44,6 +44,8 @@ PAGES = {
 """Blocks of every page that are made anew."""
 ABOUT_THE_RECIPE = ("results/pretraining.md", "scaling.md")
 """Pages that show it, and so may call it the shipped recipe only while it is."""
+SEEDS = "panda-cube"
+"""Name of the recorded seeds of the recipe."""
 Results = Mapping[str, Mapping[str, Any]]
 """Recorded files by the name of their benchmark."""
 Blocks = dict[str, list[str]]
@@ -101,7 +103,7 @@ class Report:
                 recipe.check_words(self._docs / page, words, studies[RECIPE])
         headline = {"headline": [comparison.headline_table(trials)]}
         made = measured_blocks(found) | {
-            "results/pretraining.md": self.pretraining_blocks(runs, found, studies),
+            "results/pretraining.md": self.pretraining_blocks(runs, found, studies, read_all(self._results / "seeds")),
             "results/skills.md": self.skills_blocks(recorded_skills, controls, runs),
             "results/comparison.md": self.comparison_blocks(trials, longer),
             "downstream.md": headline,
@@ -118,7 +120,7 @@ class Report:
             self.files.append(path)
         self.files += write_results(self._results, trials)
 
-    def pretraining_blocks(self, runs: Sequence[Run], found: Results, studies: Results) -> Blocks:
+    def pretraining_blocks(self, runs: Sequence[Run], found: Results, studies: Results, seeds: Results) -> Blocks:
         """Parts of the blocks about pre-training."""
         show = self.show
         counted = [run for run in runs if "curriculum" in run]  # older files have only a sample of the goals
@@ -138,6 +140,7 @@ class Report:
         ]
         return {
             "skill": [recipe.recipe_words(studies[RECIPE]), time_to_skill.report(studies[RECIPE])],
+            "seeds": [text(seeds[SEEDS]) for text in (recipe.recipe_words, pretraining.seeds_block) if SEEDS in seeds],
             "champion": [pretraining.champion_words(runs)],
             "tasks": [pretraining.tasks_table(runs)],
             "curves": [

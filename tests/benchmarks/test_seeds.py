@@ -1,0 +1,74 @@
+"""Several seeds of a recipe: what is measured of each, and the table of them."""
+
+import json
+import sys
+
+import pytest
+
+from benchmarks import seeds
+from benchmarks.report.pretraining import num_dips, seeds_block
+from service.runs import train
+from tests.runs.runs import TREE, write_yaml
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch):
+    """Run the benchmark on a tiny recipe; returns what it wrote."""
+    (tmp_path / "configs" / "pretrain").mkdir(parents=True)
+    write_yaml(
+        tmp_path / "configs" / "pretrain" / "tiny_one.yaml", TREE | {"run": TREE["run"] | {"checkpoint_interval": 1}}
+    )
+    monkeypatch.setattr(seeds, "ROOT", tmp_path)
+    monkeypatch.setattr(seeds, "NUM_EPISODES", 4)
+    monkeypatch.setattr(seeds, "NUM_EVALUATED", 2)
+    monkeypatch.setattr(train, "make_artifacts", lambda *arguments: {})  # a video takes half a minute
+
+    def run(*words):
+        given = ["tiny-one", "--runs", str(tmp_path / "runs"), "--json", str(tmp_path / "tiny.json"), *words]
+        monkeypatch.setattr(sys, "argv", ["seeds", *given])
+        code = seeds.main()
+        return code, json.loads((tmp_path / "tiny.json").read_text())
+
+    return run
+
+
+def test_each_seed_is_measured_at_the_checkpoints_nearest_to_what_is_asked(command, capsys):
+    code, found = command("--seeds", "3,4", "--at", "0.0001,0.0006", "--set", "run.evaluation_interval=1")
+    assert (code, [run["seed"] for run in found["runs"]]) == (0, [3, 4])
+    for run in found["runs"]:
+        first, last = run["measured"]
+        assert abs(first["env_steps"] - 100) < abs(last["env_steps"] - 100)
+        assert last["env_steps"] >= 600
+        assert all(set(first[kind]) == {"last", "ever"} for kind in seeds.KINDS)
+        assert run["curve"][-1]["env_steps"] == last["env_steps"]
+        assert set(run["curve"][-1]) >= {"mixed", "table", "air", "wall_s"}
+    assert "seed 4 at 0.00 M: mixed" in capsys.readouterr().out
+    again = command("--seeds", "4", "--at", "0.0001,0.0006", "--set", "run.evaluation_interval=1")[1]
+    assert again == found  # a seed that the file has is not run again
+    code, _ = command("--seeds", "5", "--at", "0.0001", "--set", "game.bob_steps=3")
+    assert code == 2
+    assert "its seeds had other settings; name another file" in capsys.readouterr().err
+
+
+def test_dips_are_two_in_a_row_after_four_million():
+    rates = [(3.9, 0.1), (4.1, 0.94), (4.2, 0.96), (4.3, 0.90), (4.4, 0.94), (4.5, 0.949), (4.6, 0.95)]
+    curve = [{"env_steps": millions * 1e6, "mixed": rate} for millions, rate in rates]
+    assert num_dips(curve) == 2  # 0.90 and 0.94, 0.94 and 0.949; not 0.1 and 0.94, which begin earlier
+
+
+def test_the_table_of_seeds_by_hand():
+    def row(asked, mixed):
+        return {"asked": asked} | {kind: {"last": mixed} for kind in seeds.KINDS}
+
+    runs = [
+        {"seed": 1, "measured": [row(2e6, 0.95), row(5e6, 0.978)], "curve": []},
+        {"seed": 2, "measured": [row(2e6, 0.949)], "curve": []},
+    ]
+    assert seeds_block({"runs": runs}).splitlines() == [
+        "| seed | 2 M: mixed, table, air, *Larger* | 5 M: mixed, table, air, *Larger* | dips |",
+        "| --- | --- | --- | --- |",
+        "| 1 | 95.0, 95.0, 95.0, 95.0 | 97.8, 97.8, 97.8, 97.8 | 0 |",
+        "| 2 | 94.9, 94.9, 94.9, 94.9 |  | 0 |",
+        "",
+        "At least 95 % of mixed goals: 1 of 2 at 2 M, 1 of 1 at 5 M env steps.",
+    ]
