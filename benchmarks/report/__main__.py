@@ -39,7 +39,7 @@ PAGES = {
     "results/transfer.md": ("transfer", "transfer_champion"),
     "results/README.md": ("throughput", "mutation"),
     "../README.md": ("headline",),
-    "scaling.md": ("box", "batches"),
+    "scaling.md": ("box",),
 }
 """Blocks of every page that are made anew."""
 ABOUT_THE_RECIPE = ("results/pretraining.md", "scaling.md")
@@ -110,7 +110,6 @@ class Report:
             "../README.md": headline,
             "scaling.md": {
                 "box": [scaling.box_block(found.get("scaling_box", found["scaling"]))],
-                "batches": [recipe.batches_block(studies), recipe.recipe_words(studies[RECIPE])],
             },
         }
         for page, blocks in made.items():

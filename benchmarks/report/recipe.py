@@ -1,15 +1,13 @@
-"""Times to a skill: whether their recipe is the one that ships, what a page may say of it, sizes of updates."""
+"""Times to a skill: whether their recipe is the one that ships, and what a page may say of it."""
 
 from __future__ import annotations
 
-import math
-import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from benchmarks.measuring import RECIPE_FILE
-from benchmarks.report.markdown import commit, millions, table
+from benchmarks.report.markdown import commit
 from service.base.errors import TandemError
 from service.config import load_config
 from service.config.self_play import SelfPlayConfig
@@ -78,26 +76,3 @@ def _leaves(tree: Mapping[str, Any], above: str = "") -> dict[str, Any]:
     for key, value in tree.items():
         found |= _leaves(value, f"{above}{key}.") if isinstance(value, dict) else {f"{above}{key}": value}
     return found
-
-
-def batches_block(studies: Mapping[str, Mapping[str, Any]]) -> str:
-    """Env steps and updates until the skill, by worlds of an update; medians, a seed that was not there is infinite."""
-    head = ("worlds", "recorded in", "seeds that were there", "env steps", "updates", "the recipe's, same seeds")
-    rows = []
-    for name, study in sorted(studies.items(), key=lambda item: item[1]["settings"]["num_worlds"]):
-        seeds = {run["seed"] for run in study["runs"]}
-        same = [run for run in studies[RECIPE]["runs"] if run["seed"] in seeds]
-        there = f"{sum(run['reached'] for run in study['runs'])} of {len(seeds)}"
-        steps, updates = _median(study["runs"], "env_steps"), _median(study["runs"], "iteration")
-        numbers = _number(steps, millions), _number(updates), _number(_median(same, "iteration"))
-        rows.append([str(study["settings"]["num_worlds"]), f"`{name}.json`", there, *numbers])
-    return table(head, rows)
-
-
-def _median(runs: Sequence[Mapping[str, Any]], key: str) -> float:
-    """Median of what the skill took; a seed that was not there never is."""
-    return float(statistics.median(run["at"][key] if run["reached"] else math.inf for run in runs))
-
-
-def _number(value: float, write: Callable[[float], str] = "{:,.0f}".format) -> str:
-    return write(value) if math.isfinite(value) else ""
