@@ -247,12 +247,13 @@ class ABCConfig(CloningConfig):
         description="also clone steps of Bob's failed turns, relabelled with where the object ended (Ghosh et al. "
         "2021); no more than there are of Alice's",
     )
-    max_success: float = Field(
+    whole_max_success: float = Field(
         1.0,
         ge=0.0,
         le=1.0,
-        description="clone only in updates in which Bob solved no more than this share of his turns. Later "
-        "demonstrations are what is left of failures: he stands still and dithers, and learns to from it",
+        description="clone whole turns only in updates in which Bob solved no more than this share of his. Later most "
+        "of what he fails is standing and dithering, which he would learn: then only steps in which the object is at "
+        "the goal are cloned, by their mean. They teach him to stay, which his turns, that end there, do not",
     )
 
 
