@@ -195,9 +195,10 @@ class Learner:
         """The steps in which the object is at the goal; None where there are none."""
         seen, distance_m = self._layouts.bob.columns, self.config.success_distance_m
         goal, place = (demonstrations.observation[:, seen[name]] for name in ("goal", "object"))
-        rows = ((goal - place).norm(dim=1) <= distance_m).nonzero().flatten()
-        columns = (column.index_select(0, rows) for column in (demonstrations.observation, demonstrations.action))
-        return DemonstrationRows(*columns, demonstrations.mirror) if len(rows) else None
+        near = (goal - place).norm(dim=1) <= distance_m
+        if not near.any():
+            return None
+        return DemonstrationRows(demonstrations.observation[near], demonstrations.action[near], demonstrations.mirror)
 
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
         config, bob = self.config.learner, self._bob
