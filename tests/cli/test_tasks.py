@@ -139,9 +139,9 @@ def test_an_interrupted_run_is_published_and_a_running_one_is_not(tmp_path):
 def test_what_learns_nothing_is_measured_as_a_run_is(tmp_path):
     written = {}
     for method in ("idle", "asp-only"):
-        done = tandem("evaluate", "--task", "push", "--method", method, "--episodes", 4, "--out", f"o/{method}.json")
+        done = tandem("evaluate", "--task", "push", "--method", method, "--episodes", 8, "--out", f"o/{method}.json")
         assert done.exit_code == 0, done.output
-        assert "4 random goals of Push (table)" in done.stdout
+        assert "8 random goals of Push (table)" in done.stdout
         written[method] = json.loads((tmp_path / "o" / f"{method}.json").read_text())
     idle, bob = written.values()
     assert (idle["task"], idle["method"], idle["seed"], idle["primitives"], idle["env_steps"]) == (
@@ -153,7 +153,7 @@ def test_what_learns_nothing_is_measured_as_a_run_is(tmp_path):
         "num_episodes", "num_steps", "mean_distance_m",
         *(f"success_{each}{end}" for each in ("last", "ever") for end in ("", "_low", "_high")),
     }  # fmt: skip
-    rows = json.loads(tandem("evaluate", "panda-cube", "--task", "push", "--episodes", 4, "--json").stdout)
+    rows = json.loads(tandem("evaluate", "panda-cube", "--task", "push", "--episodes", 8, "--json").stdout)
     assert rows["idle"]["mean_distance_m"] == idle["evaluation"]["mean_distance_m"]
     assert rows[f"{CHAMPION} (bundled)"]["mean_distance_m"] == bob["evaluation"]["mean_distance_m"]
     for words, arguments in (

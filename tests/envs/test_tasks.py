@@ -200,7 +200,7 @@ class TestVector:
 
 def assert_touched(distance):
     """A cube's centre came as near to a face as it can: half its edge, or half its diagonal if it turned."""
-    assert (distance > 0.025 - 0.004).all()
+    assert (distance > 0.025 - 0.002).all()
     assert (distance < 0.025 * np.sqrt(2) + 0.001).all()
 
 
@@ -225,7 +225,11 @@ class TestFixtures:
     SIDES = np.array([-1.0, 1.0])
 
     def pushed(self, task, place):
-        """Least distance from an object's centre to the middle of ``place`` along x, pushed from either side."""
+        """Distance from an object's centre to the middle of ``place`` along x, pushed from either side.
+
+        Returns:
+            The least, (2,), where the arm strikes at full speed, and that at the end, (2,), where it leans on.
+        """
         config = TASKS[task].world_from(CONFIG)
         with WorldBatch(config, 2, num_threads=1) as worlds:
             worlds.reset(np.random.default_rng(0))
@@ -238,16 +242,19 @@ class TestFixtures:
             nearest = np.full(2, np.inf)
             for _ in range(20):
                 drive(worlds, lambda: worlds.object_position * [1, 1, 0] - behind + [0, 0, 0.02], 1)
-                nearest = np.minimum(nearest, (worlds.object_position[:, 0] - place[0]) * self.SIDES)
-            return nearest
+                distance = (worlds.object_position[:, 0] - place[0]) * self.SIDES
+                nearest = np.minimum(nearest, distance)
+            return nearest, distance
 
     def test_an_object_is_not_pushed_through_a_wall(self):
-        nearest = self.pushed("wall", np.array([-0.05, 0.0, 0.0]))
-        assert_touched(nearest - 0.005)
+        nearest, at_last = self.pushed("wall", np.array([-0.05, 0.0, 0.0]))
+        assert (nearest > 0.025 - 0.001).all()  # struck with 500 N it is 6 mm inside the wall of 10 mm
+        assert_touched(at_last - 0.005)
 
     def test_an_object_is_not_pushed_into_a_box_and_no_box_is_pushed(self):
-        nearest = self.pushed("box", np.array([-0.05, 0.05, 0.0]))
+        nearest, at_last = self.pushed("box", np.array([-0.05, 0.05, 0.0]))
         assert_touched(nearest - 0.05)
+        assert_touched(at_last - 0.05)
 
     def test_a_gripper_stands_on_a_wall_and_on_a_rim(self):
         for task, x, height in (("wall", 0.0, 0.07), ("box", 0.0475, 0.05)):
