@@ -189,11 +189,11 @@ class PPOConfig(FrozenModel):
         description="first updates of a run in which the value network learns and the policy stays: one that begins "
         "from a trained policy (--from) would else be led by a network that knows nothing",
     )
-    settle_after_updates: int | None = Field(
+    rate_decay_after_updates: int | None = Field(
         None,
         ge=1,
-        description="from this update N on the learning rate is at most its upper bound times N over the number of "
-        "updates: small enough for the average of a policy to settle. None: it stays",
+        description="from this update N on the bound of the learning rate falls as N over the number of updates: steps "
+        "small enough for the average of a policy to settle. None: it stays",
     )
 
 

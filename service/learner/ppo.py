@@ -353,13 +353,13 @@ def _adapted_learning_rate(player: Player, kl: float) -> float:
 
 
 def _highest_learning_rate(player: Player, version: int) -> float:
-    """The upper bound, and once a player is to settle less and less: as 1 over the number of updates.
+    """The highest learning rate of an update: the upper bound, or less where the rate decays as 1 over their number.
 
     With steps like these the average of where gradient steps come by goes to one point (Robbins and Monro 1951, Polyak
     and Juditsky 1992); with steps of one length it wanders.
     """
     config, highest = player.config, player.config.learning_rate * LEARNING_RATE_BOUNDS[1]
-    return highest * min(1.0, (config.settle_after_updates or math.inf) / (version + 1))
+    return highest * min(1.0, (config.rate_decay_after_updates or math.inf) / (version + 1))
 
 
 def _join(turns: Sequence[Turns], name: str) -> Array:

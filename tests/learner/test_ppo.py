@@ -271,7 +271,7 @@ def test_learning_rate_follows_the_kl_within_bounds(target_kl, num_updates, mult
     [(2, 2.0), (3, 2.0), (7, 1.0), (39, 0.2)],  # of updates 3, 4, 8, 40: twice the rate, times 4 / number at most
 )
 def test_a_player_that_settles_has_a_learning_rate_that_falls_with_the_number_of_updates(version, multiple):
-    player, rng = make_player(target_kl=1e3, num_epochs=1, settle_after_updates=4), np.random.default_rng(0)
+    player, rng = make_player(target_kl=1e3, num_epochs=1, rate_decay_after_updates=4), np.random.default_rng(0)
     for _ in range(2):  # so small a KL raises it to the bound
         ppo.update(player, play(player, rng, num=32), None, ABC, np.random.default_rng(0), version=version)
     assert player.optimizer.learning_rate == pytest.approx(CONFIG.learning_rate * multiple)
