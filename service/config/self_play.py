@@ -247,14 +247,6 @@ class ABCConfig(CloningConfig):
         description="also clone steps of Bob's failed turns, relabelled with where the object ended (Ghosh et al. "
         "2021); no more than there are of Alice's",
     )
-    whole_max_success: float = Field(
-        1.0,
-        ge=0.0,
-        le=1.0,
-        description="clone whole turns only in updates in which Bob solved no more than this share of his. Later most "
-        "of what he fails is standing and dithering, which he would learn: then only steps in which the object is at "
-        "the goal are cloned, by their mean. They teach him to stay, which his turns, that end there, do not",
-    )
 
 
 class LearnerConfig(FrozenModel):
@@ -280,6 +272,14 @@ class LearnerConfig(FrozenModel):
         description="the Bob that is evaluated and published is an exponential moving average of his parameters, over "
         "about the last 1 / (1 - decay) versions, or an eighth of all if that is less; 0: the last version. Acting "
         "and learning do not use it",
+    )
+    bob_help_max_success: float = Field(
+        1.0,
+        ge=0.0,
+        le=1.0,
+        description="Bob clones demonstrations, and learns from mirrored samples, only in updates in which he solved no "
+        "more than this share of his turns. Both speed up what he learns first. Later most of what he fails is standing "
+        "and dithering, which he would clone, and a mirrored action is far from what he would do",
     )
     abc: ABCConfig = ABCConfig()
     self_imitation: SelfImitationConfig = SelfImitationConfig()

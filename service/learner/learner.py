@@ -191,28 +191,18 @@ class Learner:
         metrics = ppo.update(self._alice, samples, imitated, how, self._rng, version=self.version)
         return _prefixed("alice", metrics) | counted
 
-    def _at_goal(self, demonstrations: DemonstrationRows) -> DemonstrationRows | None:
-        """The steps in which the object is at the goal; None where there are none."""
-        seen, distance_m = self._layouts.bob.columns, self.config.success_distance_m
-        goal, place = (demonstrations.observation[:, seen[name]] for name in ("goal", "object"))
-        near = (goal - place).norm(dim=1) <= distance_m
-        if not near.any():
-            return None
-        return DemonstrationRows(demonstrations.observation[near], demonstrations.action[near], demonstrations.mirror)
-
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
         config, bob = self.config.learner, self._bob
         samples = ppo.collect([rollout.bob for rollout in rollouts], bob)
         metrics = {"num_bob_samples": float(_num(samples))}
-        mirrors = config.bob.mirror == "random"
-        if samples is not None and mirrors:
+        mirrors, helped = config.bob.mirror == "random", solved_share(rollouts) <= config.bob_help_max_success
+        if samples is not None and mirrors and helped:
             samples = reflect_at_random(samples, self._layouts, bob, self._rng)
         demonstrations = self._to_clone(DEMONSTRATIONS, [each.demonstrations for each in rollouts])
         metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + mirrors))
-        how = config.abc
-        if solved_share(rollouts) > how.whole_max_success and demonstrations is not None:
-            demonstrations, how = self._at_goal(demonstrations), how.model_copy(update={"mean_only": True})
-        updated = ppo.update(bob, samples, demonstrations, how, self._rng, version=self.version)
+        updated = ppo.update(
+            bob, samples, demonstrations if helped else None, config.abc, self._rng, version=self.version
+        )
         metrics |= _prefixed("bob", updated)
         rows = samples if samples is not None else demonstrations
         if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):

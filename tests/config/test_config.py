@@ -126,8 +126,8 @@ def test_overrides_beat_the_file_and_the_last_one_wins(tmp_path):
         ("game.bob_margin_m=0.05", ["game: bob_margin_m 0.05 must be less than success_distance_m 0.05"]),
         ("generator.goal_source=hers", ["generator.goal_source = 'hers'", "'alice', 'reached', 'uniform'"]),
         (
-            "learner.abc.whole_max_success=1.5",
-            ["learner.abc.whole_max_success = 1.5", "less than or equal to 1"],
+            "learner.bob_help_max_success=1.5",
+            ["learner.bob_help_max_success = 1.5", "less than or equal to 1"],
         ),
         ("world.object={shape: cone, size_m: [0.05]}", ["world.object.shape = 'cone'"]),
         ("world.object={shape: cylinder, size_m: [0.05]}", ["size_m of a cylinder has 2 numbers", "height; got 1"]),

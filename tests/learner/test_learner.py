@@ -334,34 +334,20 @@ def test_how_many_of_his_turns_bob_solved():
     assert solved_share([make_rollout(learner, 0)]) == 0.0
 
 
-@pytest.mark.parametrize(("solved", "whole"), [([True, False], True), ([True, True, False], False)])
-def test_bob_clones_whole_turns_until_he_solves_more_than_that(solved, whole):
-    """Later only the steps in which the object is at the goal, by their mean: as if there were no others."""
+@pytest.mark.parametrize(("solved", "helped"), [([True, False], True), ([True, True, False], False)])
+def test_bob_is_helped_until_he_solves_more_than_that(solved, helped):
+    """Help is clones and mirrored samples; without it he learns as if the recipe had neither."""
     records = make_records(np.zeros((len(solved), 3)), solved=solved)
-    shown = make_rollout(Learner(make_config()), 0).demonstrations
-    goal, place = (shown.observation[:, BOB.columns[name]] for name in ("goal", "object"))
-    place[:] = np.where(np.arange(len(place))[:, None] % 3 == 0, goal + 0.02, goal + 0.2)  # every third is 3.5 cm off
-    at_goal = np.linalg.norm(goal - place, axis=1) <= 0.05
-    assert 0 < at_goal.sum() < len(at_goal)
-    cloned = slice(None) if whole else at_goal
-    some = replace(shown, observation=shown.observation[cloned], action=shown.action[cloned])
-    learners = [
-        Learner(make_config(abc={"whole_max_success": 0.5})),
-        Learner(make_config(abc={"mean_only": not whole})),
-    ]
-    for learner, demonstrations in zip(learners, (shown, some), strict=True):
-        updated(learner, 0, records=records, demonstrations=demonstrations)
-    one, other = (learner.weights().bob for learner in learners)
-    assert all(np.array_equal(one[name], other[name]) for name in one)
-
-
-def test_bob_clones_nothing_where_no_object_is_at_its_goal():
-    learner = Learner(make_config(abc={"whole_max_success": 0.0}))
-    shown = make_rollout(learner, 0).demonstrations
-    shown.observation[:, BOB.columns["goal"]] = shown.observation[:, BOB.columns["object"]] + 1.0
-    metrics = updated(learner, 0, records=make_records(np.zeros((1, 3)), solved=[True]), demonstrations=shown)
-    assert metrics["learner/num_demonstrations"] == len(shown.observation)  # they are kept: the next may clone them
-    assert "learner/cloning_loss" not in metrics
+    some = Learner(make_config(bob={"mirror": "random"}, bob_help_max_success=0.5))
+    if helped:
+        other = Learner(make_config(bob={"mirror": "random"}))
+    else:
+        other = Learner(make_config(abc={"weight": 0.0}))
+    metrics = [updated(learner, 0, records=records) for learner in (some, other)]
+    assert ("learner/cloning_loss" in metrics[0]) == helped
+    assert metrics[0]["learner/num_demonstrations"] > 0  # they are kept, as the next update may clone
+    bobs = [learner.weights().bob for learner in (some, other)]
+    assert all(np.array_equal(bobs[0][name], bobs[1][name]) for name in bobs[0])
 
 
 def test_a_broken_turn_leaves_the_player_as_it_was():
