@@ -277,9 +277,9 @@ class LearnerConfig(FrozenModel):
         1.0,
         ge=0.0,
         le=1.0,
-        description="Bob clones demonstrations, and learns from mirrored samples, only in updates in which he solved no "
-        "more than this share of his turns. Both speed up what he learns first. Later most of what he fails is standing "
-        "and dithering, which he would clone, and a mirrored action is far from what he would do",
+        description="Bob clones demonstrations and learns from mirrored samples only in updates in which he solved no "
+        "more than this share of his turns. Both speed up what he learns first. Later most of what he fails is "
+        "standing and dithering, and clones teach him that; and a mirrored action is far from what he would do",
     )
     abc: ABCConfig = ABCConfig()
     self_imitation: SelfImitationConfig = SelfImitationConfig()

@@ -339,10 +339,7 @@ def test_bob_is_helped_until_he_solves_more_than_that(solved, helped):
     """Help is clones and mirrored samples; without it he learns as if the recipe had neither."""
     records = make_records(np.zeros((len(solved), 3)), solved=solved)
     some = Learner(make_config(bob={"mirror": "random"}, bob_help_max_success=0.5))
-    if helped:
-        other = Learner(make_config(bob={"mirror": "random"}))
-    else:
-        other = Learner(make_config(abc={"weight": 0.0}))
+    other = Learner(make_config(**{"bob": {"mirror": "random"}} if helped else {"abc": {"weight": 0.0}}))
     metrics = [updated(learner, 0, records=records) for learner in (some, other)]
     assert ("learner/cloning_loss" in metrics[0]) == helped
     assert metrics[0]["learner/num_demonstrations"] > 0  # they are kept, as the next update may clone
