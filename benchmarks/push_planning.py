@@ -17,9 +17,11 @@ import numpy as np
 
 from benchmarks.measuring import of_each, run_benchmark
 from service.actors.evaluation import wilson_interval
+from service.config.run import SUCCESS_DISTANCE_M
 from service.envs.batch import WorldBatch
 from service.envs.sampling import Places, draw_goals
-from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
+from service.envs.task import EPISODE_STEPS
+from service.envs.tasks import find_task
 from service.methods.compose import check_primitives
 from service.registry.learned import compose_actions
 

@@ -31,8 +31,8 @@ from service.base.errors import TandemError
 from service.base.types import StateArray
 from service.config import Config
 from service.config.skills import SkillDiscoveryConfig
-from service.envs.tasks import EPISODE_STEPS, Task
-from service.envs.tasks import TASKS as DOWNSTREAM
+from service.envs.task import EPISODE_STEPS, Task
+from service.envs.tasks import find_task
 from service.media.artifacts import COVERAGE_STEPS
 from service.media.figures import read_records
 from service.policies.frozen_skills import FrozenSkills
@@ -63,8 +63,8 @@ TASKS = {
     "mixed": Task("Mixed", "anywhere in the workspace with probability 0.7, else on the table", "mixed"),
     "air": Task("Air", "more than 5 cm above an object that rests on the table", "air"),
     "table": Task("Table", "on the table", "table"),
-    "larger": DOWNSTREAM["larger"],
-    "sphere": DOWNSTREAM["sphere"],
+    "larger": find_task("larger"),
+    "sphere": find_task("sphere"),
 }
 ASKED_RATES = {"mixed": 0.95, "air": 0.95, "table": 0.95, "larger": 0.90, "sphere": 0.85}
 """Success at the last step that we ask of Bob."""
@@ -175,7 +175,7 @@ def measure_tasks(
             result = evaluate(
                 policy,
                 task.world_from(config.world),
-                task.goals,
+                task.goal_kind,
                 num_episodes=num_episodes,
                 num_steps=NUM_STEPS,
                 success_distance_m=config.success_distance_m,
@@ -211,7 +211,7 @@ def measure_coverage(
 
     def player(parameters: Parameters) -> _Player | None:
         if isinstance(config, SkillDiscoveryConfig):
-            return partial(skill_paths, FrozenSkills(parameters, config.skills.method), config.world, **common)
+            return partial(skill_paths, FrozenSkills(parameters, config.skills), config.world, **common)
         bob = numpy_bob(parameters)
         return partial(skill_trajectories, bob, config.world, **common) if isinstance(bob, NumpyMCPPolicy) else None
 

@@ -22,7 +22,7 @@ from pathlib import Path
 
 from benchmarks.controls import CONTROLS
 from benchmarks.measuring import ROOT
-from service.envs.tasks import TASKS, find_task
+from service.envs.tasks import PAPERS, find_task
 from service.methods.task_methods import METHODS
 
 PRIMITIVES = {0: "panda-cube@seed-0", 1: "panda-cube@seed-2", 2: "panda-cube@seed-3"}
@@ -58,7 +58,7 @@ class Experiment:
 
 def experiments(out: Path = RESULTS) -> Iterator[Experiment]:
     """Everything, the most important first; ``out`` has recorded files, and the registry in its ``primitives``."""
-    tasks = tuple(TASKS)
+    tasks = PAPERS
     for seed in PRIMITIVES:
         for method in ("ours-her", "ours", "ours-residual-her"):
             yield from (_trial(out, task, method, seed) for task in tasks)
@@ -103,7 +103,7 @@ def _table(
         *("--set", "run.num_threads=1", *extra),
     )
     versions = out / "primitives" / "models" / reference.partition("@")[0]
-    group, part = (METHODS[method].title, task) if task in TASKS else (find_task(task).title, method)
+    group, part = (METHODS[method].title, task) if task in PAPERS else (find_task(task).title, method)
     return Experiment(name, file, group, part, seed, (command,), versions)
 
 
@@ -125,7 +125,7 @@ def _skills(out: Path, seed: int) -> Iterator[Experiment]:
         rows = (method, f"{method}-zero-shot") if method in ("lsd", "metra") else (method,)
         hold = ("--set", f"skill_steps={SKILL_HOLD_STEPS}")
         for row in rows:
-            for task in TASKS:
+            for task in PAPERS:
                 settings = hold if row == method else ()
                 yield _table(out, "downstream", task, row, seed, f"{_skills_name(method, seed)}@1", settings)
 

@@ -58,7 +58,7 @@ def measure(directory: RunDirectory, config: SelfPlayConfig, at: Sequence[float]
         for kind in KINDS:
             task = TASKS[kind]
             found = evaluate(
-                bob, task.world_from(config.world), task.goals, num_episodes=NUM_EPISODES, num_steps=NUM_STEPS,
+                bob, task.world_from(config.world), task.goal_kind, num_episodes=NUM_EPISODES, num_steps=NUM_STEPS,
                 success_distance_m=config.success_distance_m, seed=SEED, num_threads=config.run.num_threads,
             )  # fmt: skip
             row[kind] = {"last": found.success_last, "ever": found.success_ever}

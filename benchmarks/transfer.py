@@ -170,7 +170,7 @@ def draw_episodes(policy: Trained, settings: Settings) -> tuple[StateArray, Stat
     """(N, 3) places of the object at first, and (N, 3) goals, metres: the same as of an evaluation in MuJoCo."""
     rng = np.random.default_rng(settings.seed)
     places = draw_objects(rng, settings.num_goals, policy.world)
-    return places.object, draw_goals(policy.goals, rng, policy.world, policy.success_distance_m, places)
+    return places.object, draw_goals(policy.goal_kind, rng, policy.world, policy.success_distance_m, places)
 
 
 def inside_limits(positions_m: StateArray, gap_s: float) -> StateArray:

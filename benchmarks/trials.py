@@ -39,7 +39,7 @@ def trial_config(task: str, method: str, seed: int, primitives: str, settings: S
     """Configuration of a trial; ``settings`` are overrides."""
     find_task(task)
     learns = find_method(method).learns  # what learns nothing is no method of a run
-    tree: dict[str, Any] = {"name": f"{task}-{method}", "task": task, "method": method if learns else "ours"}
+    tree: dict[str, Any] = {"task": task, "method": method if learns else "ours"}
     tree |= {"seed": seed, "primitives": primitives, "run": {"final_episodes": NUM_EPISODES}}
     for setting in settings:
         apply_override(tree, setting)
@@ -74,7 +74,7 @@ def _play(config: TaskConfig, registry: Path) -> dict[str, Any]:
     idle = config.method == "idle"
     player: DeterministicPolicy = IdlePolicy() if idle else load(config.primitives, registry).player()
     num, seed = config.run.final_episodes, config.seed + FINAL_SEED
-    found = evaluate_on(config.task, config.world, player, num, seed, config.run.num_threads)
+    found = evaluate_on(find_task(config.task, config.code), config.world, player, num, seed, config.run.num_threads)
     made = {"git_commit": git_commit(), "num_cores": os.cpu_count()}
     return {"evaluation": numbers_of(found), "env_steps": 0, "wall_s": 0.0, "made": made}
 
@@ -111,7 +111,7 @@ def _recorded(config: TaskConfig, registry: Path, result: dict[str, Any], record
         TRIAL: settings,
         "primitives": primitives if find_method(config.method).takes is not None else None,
         "world": trained.config.world.model_dump(mode="json"),
-        "evaluation": {"goals": find_task(config.task).goals, **result["evaluation"]},
+        "evaluation": {"goals": find_task(config.task, config.code).goal_kind, **result["evaluation"]},
         "made": {**result["made"], "num_threads": run.num_threads},
         **{key: result[key] for key in ("env_steps", "wall_s")},
         "curve": curve,

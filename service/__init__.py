@@ -11,13 +11,25 @@ from typing import TYPE_CHECKING
 from service.base.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from service.registry.loading import Trained
+    from collections.abc import Callable, Sequence
 
-__all__ = ["load", "load_policy", "load_primitives", "load_skills"]
+    from service.actors.evaluation import Evaluation
+    from service.envs.gym.vector import TabletopVectorEnv
+    from service.envs.sampling import GoalKind
+    from service.envs.task import Task
+    from service.registry.loading import Trained
+    from service.runs.run import Ending
+    from service.runs.train import Finished
+
+__all__ = ["evaluate", "load", "make_env", "train"]
 
 
 def load(
-    reference: str = "panda-cube@champion", registry: Path | str = "registry", primitives: str | None = None
+    reference: str = "panda-cube@champion",
+    registry: Path | str = "registry",
+    primitives: str | None = None,
+    *,
+    run_task_code: bool = False,
 ) -> Trained:
     """Load what was trained, ready to act, without torch; ``panda-cube@champion`` comes with the package.
 
@@ -30,6 +42,8 @@ def load(
             with, and among what comes with the package.
         primitives: what a policy of a task acts with, where that has moved. The parameters have to be those it was
             trained with.
+        run_task_code: run what code the task of a published policy brings; acting needs none. The directory of a run
+            has such code, too, and loading it runs that: load runs of those whom you trust.
 
     Returns:
         ``.policy``, ``.act_deterministic`` and ``.begin`` act; ``.primitives`` or ``.skills``, where there are some,
@@ -41,19 +55,89 @@ def load(
     """
     from service.registry import loading
 
-    return loading.load(reference, registry, primitives)
+    return loading.load(reference, registry, primitives, run_task_code=run_task_code)
 
 
-def load_primitives(reference: str = "panda-cube@champion", registry: Path | str = "registry") -> Trained:
-    """``load`` what has to be a Bob, whose ``.primitives`` compose."""
-    return load(reference, registry).expect("primitives", by="load_primitives")
+def train(
+    what: str | None = None,
+    settings: Sequence[str] = (),
+    *,
+    method: str | None = None,
+    primitives: str | None = None,
+    run_dir: Path | str | None = None,
+    registry: Path | str = "registry",
+    resume: bool = False,
+    publish: bool = False,
+    on_iteration: Callable[[dict[str, float]], Ending | None] | None = None,
+) -> Finished:
+    """Train what a recipe, a task or a file says, in this process, as ``tandem train`` does.
+
+    Args:
+        what: a recipe, a task, a YAML file, or a task of yours in ``FILE.py``; None: the recipe panda-cube, or what a
+            run has that goes on.
+        settings: ``a.b=c`` overrides.
+        method: of a task, or of skill discovery.
+        primitives: that the method of a task takes.
+        run_dir: where it keeps everything; default: ``runs/NAME``.
+        registry: where it publishes, and finds what it takes.
+        resume: go on with the run there.
+        publish: publish what was learned.
+        on_iteration: called with the metrics of every iteration; what it returns, if anything, ends the run.
+
+    Raises:
+        TandemError: a setting, a file or a directory that cannot be used.
+    """
+    from service.cli.configs import named
+    from service.config import load_config
+    from service.config.recipes import DEFAULT_RECIPE, recipes
+    from service.runs import train as training
+    from service.runs.resuming import resumed_config
+    from service.store.run_directory import RunDirectory
+
+    file, first = named(what, method, primitives)
+    overrides = [*first, *settings]
+    begun = file if file is not None or first else recipes()[DEFAULT_RECIPE]
+    path = Path(run_dir) if run_dir is not None else Path("runs") / load_config(begun, overrides).directory_name
+    directory = RunDirectory(path)
+    if resume:
+        config = resumed_config(directory, overrides, file)
+    else:
+        config = load_config(begun, overrides).begin(registry, None)
+    told = on_iteration or (lambda metrics: None)
+    return training.train(config, directory, Path(registry), resume=resume, publish=publish, on_iteration=told)
 
 
-def load_skills(reference: str, registry: Path | str = "registry") -> Trained:
-    """``load`` what has to be ``.skills`` of a skill-discovery baseline."""
-    return load(reference, registry).expect("skills", by="load_skills")
+def evaluate(
+    trained: Trained, task: str | None = None, *, goals: GoalKind | None = None, num_episodes: int = 300, seed: int = 0
+) -> Evaluation:
+    """Measure a policy without noise on random goals, as ``tandem evaluate`` does.
+
+    Args:
+        trained: as ``load`` gives it.
+        task: to be played in place of its own, by name or file.
+        goals: ``table``, ``air``, ``volume`` or ``mixed`` in place of the task's.
+        num_episodes: each from a fresh reset.
+        seed: of the episodes.
+    """
+    from service.actors import evaluation
+    from service.methods.task_evaluation import FINAL_SEED
+
+    on = trained.on(task)
+    first_seed = seed if on.task is None else seed + FINAL_SEED
+    return evaluation.evaluate(
+        on.player(), on.world, on.on_goals(goals), num_episodes=num_episodes,
+        num_steps=on.num_steps, success_distance_m=on.success_distance_m, seed=first_seed,
+    )  # fmt: skip
 
 
-def load_policy(reference: str, registry: Path | str = "registry", primitives: str | None = None) -> Trained:
-    """``load`` what has to be a policy of a downstream task."""
-    return load(reference, registry, primitives).expect("orchestrator", by="load_policy")
+def make_env(task: str | Task | None = None, trained: Trained | None = None, *, num_envs: int = 1) -> TabletopVectorEnv:
+    """N worlds of a task as one Gymnasium vector environment; ``gymnasium.make`` has single ones.
+
+    Args:
+        task: by name or file, or an object; None: goals anywhere.
+        trained: in whose world it is; None: the paper's.
+        num_envs: N.
+    """
+    from service.envs.gym.vector import TabletopVectorEnv
+
+    return TabletopVectorEnv(num_envs, None if trained is None else trained.config.world, task=task)

@@ -9,7 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-import service
+import tandem_skills
 from service.base.errors import TandemError
 from service.cli.main import app
 from tests.methods.trials import SETS
@@ -26,13 +26,14 @@ def small_site(root, text):
     (root / "docs").mkdir()
     (root / "docs" / "zensical.toml").write_text(SETTINGS)
     (root / "docs" / "index.md").write_text(text)
+    (root / "docs" / "reference").mkdir()
+    (root / "docs" / "reference" / "cli.md").write_text("# Commands\n")
     return root
 
 
 @pytest.fixture
 def no_other_pages(monkeypatch):
     monkeypatch.setattr("tools.docs_site.OUTSIDE", {})
-    monkeypatch.setattr(docs_reference, "pages", lambda: {"reference/cli.md": "# Commands\n"})
 
 
 def test_the_site_builds(tmp_path):
@@ -94,11 +95,18 @@ def test_every_key_is_in_the_reference():
     assert "| `world.num_substeps` | `20` | `8` | `>= 1`, `<= 200` | physics steps per action;" in text
 
 
-def test_the_public_functions_are_in_the_reference():
+def test_the_reference_is_that_of_this_code():
+    pages = {name: (ROOT / "docs" / name).read_text() for name in docs_reference.pages()}
+    assert pages == docs_reference.pages(), "python -m tools.docs_reference writes them anew"
+
+
+def test_the_public_names_are_in_the_reference():
     text = docs_reference.api()
-    assert [name for name in service.__all__ if f"### service.{name}\n" not in text] == []
+    for name in tandem_skills.__all__:
+        assert f"### tandem.{name}\n" in text or f"### {name}\n" in text or name == "errors", name
     assert "- `reference`: NAME, NAME@ALIAS or NAME@VERSION; or the path of a run" in text
-    assert "### Trained.primitives\n" in text
+    assert "#### Trained.primitives\n" in text
+    assert "- `ConfigError`: A configuration the user can mend;" in text
     assert "- `label: str`: Where it comes from, such as `panda-cube@3 (bundled)`." in text
 
 
@@ -155,11 +163,17 @@ def test_start_heres_task_is_learned_measured_and_loaded(tmp_path, monkeypatch):
     assert names["action"].shape == (3, 4)
 
 
+def test_the_task_that_is_shown_whole_is_the_example():
+    shown, *_ = blocks((ROOT / "docs" / "own_task.md").read_text(), "python")
+    assert (ROOT / "docs" / "examples" / "lift_and_hold.py").read_text().endswith(f'"""\n\n{shown}')
+    assert len([line for line in shown.splitlines() if line]) == 15
+
+
 def test_start_here_runs_as_a_program(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     measure, goal, mix, task = blocks(START, "python")
-    assert '"mixed", 100' in measure
-    exec(compile(measure.replace('"mixed", 100', '"mixed", 4'), "start.md", "exec"), {})
+    assert "num_episodes=100" in measure
+    exec(compile(measure.replace("num_episodes=100", "num_episodes=4"), "start.md", "exec"), {})
     assert re.match(r"Bob takes the cube to \d+% of them, within \d\.\d{3} m", capsys.readouterr().out)
     exec(compile(goal, "start.md", "exec"), {})
     found = re.fullmatch(r"the cube is (\d+\.\d) cm from the goal\n", capsys.readouterr().out)

@@ -30,7 +30,7 @@ import sys
 from pathlib import Path
 import service
 assert "numpy" not in sys.modules
-bob = service.load_primitives("panda-cube@champion")
+bob = service.load("panda-cube@champion")
 assert "torch" not in sys.modules
 print(bob.label, Path(service.__file__).parents[1], sep="\\n")
 """
@@ -93,9 +93,9 @@ def test_an_installed_tandem_evaluates_them_in_any_directory(installed, tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_load_primitives(tmp_path, monkeypatch):
+def test_loading_the_champion(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    bob = service.load_primitives()
+    bob = service.load()
     manifest, parameters = Registry(BUNDLED).load("panda-cube@champion")
     assert bob.manifest == manifest
     assert bob.config == acting_config(manifest.config, where="the manifest")
@@ -104,14 +104,14 @@ def test_load_primitives(tmp_path, monkeypatch):
     expected = NumpyMCPPolicy(parameters)
     assert np.array_equal(bob.primitives.act_deterministic(rows), expected.act_deterministic(rows))
     with pytest.raises(TandemError, match=r"no 'nobody' in the registry here; .* with tandem comes: panda-cube"):
-        service.load_primitives("nobody", registry="here")
+        service.load("nobody", registry="here")
 
 
 def test_the_champion_has_what_its_manifest_says():
     """Its rate, which pages repeat, on other goals: not lower than chance explains."""
     from service.actors.evaluation import evaluate, wilson_interval
 
-    bob, num = service.load_primitives(), 60
+    bob, num = service.load(), 60
     said = bob.manifest.metrics["evaluation/mixed_success_last"]
     assert said >= 0.95  # what was asked for
     reach_m = bob.config.game.success_distance_m
@@ -137,7 +137,7 @@ from service.runs import train
 train.make_artifacts = lambda directory, registry: {}
 real = evaluation.evaluate
 evaluation.evaluate = lambda *all, **more: real(*all, **more | {"num_episodes": 2, "num_steps": 2})
-sys.argv = ["tandem", "demo", "--env-steps", "1"]
+sys.argv = ["tandem", "demo", "--no-browser", "--env-steps", "1"]
 from service.cli.main import main
 main()
 """
@@ -148,7 +148,12 @@ def test_the_demo_needs_no_checkout(installed, tmp_path):
     assert "panda-cube-demo@1 in runs/demo-1/registry" in said
     assert "tandem serve --runs runs" in said
     config = load_config(tmp_path / "runs" / "demo-1" / "config.yaml")
-    chosen = ["name=panda-cube-demo", "run.total_env_steps=1", "run.evaluation_interval=25"]
+    chosen = [
+        "name=panda-cube-demo",
+        "run.total_env_steps=1",
+        "run.evaluation_interval=60",
+        "run.checkpoint_interval=10",
+    ]
     assert config == load_config(recipes()["panda-cube"], chosen)
 
 

@@ -1,4 +1,7 @@
-"""The reference pages of the docs site, made from the code: commands, configuration, public API."""
+"""The pages below ``docs/reference``, made from the code: commands, configuration, public API.
+
+``python -m tools.docs_reference`` writes them; a test tells when they are old.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-import service
+import tandem_skills
+from benchmarks.measuring import ROOT
 from benchmarks.report.markdown import cell, table
 from service.cli.main import app
 from service.config import Config, load_config
@@ -31,13 +35,14 @@ RETURNED = (
     ("service.registry.loading", "Trained"),
     ("service.policies.numpy_policy", "NumpyMCPPolicy"),
     ("service.policies.frozen_skills", "FrozenSkills"),
-    ("service.methods.compose", "ComposePrimitives"),
+    ("service.actors.evaluation", "Evaluation"),
+    ("service.runs.train", "Finished"),
 )
-"""What the public functions return, and what is built from it."""
+"""What the public functions return."""
 
 
 def pages() -> dict[str, str]:
-    """Markdown of every generated page, by its path below ``docs/``."""
+    """Markdown of every page, by its path below ``docs/``."""
     return {"reference/cli.md": commands(), "reference/config.md": configuration(), "reference/api.md": api()}
 
 
@@ -75,14 +80,14 @@ def configuration() -> str:
         *_models(SelfPlayConfig, "", recipe),
     ]
     for kind in method_classes()[1:]:
-        names = ", ".join(name for name in METHODS if find_class(name) is kind)
+        names = ", ".join(name for name in METHODS if find_class(name, {}) is kind)
         parts += [f"## method: {names}", *list(_models(kind, "", None, SelfPlayConfig))[1:]]
     return "\n\n".join(parts) + "\n"
 
 
 def method_classes() -> list[type[Config]]:
     """The classes of the configurations of all methods, that of self-play first."""
-    return list(dict.fromkeys(find_class(name) for name in METHODS))
+    return list(dict.fromkeys(find_class(name, {}) for name in METHODS))
 
 
 def keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
@@ -173,14 +178,23 @@ def _literals(annotation: Any) -> Iterator[str]:
 
 
 def api() -> str:
-    """The functions of ``service``, and the classes that they return."""
-    parts = ["# Python API", "Made from the docstrings.", "## service", inspect.cleandoc(service.__doc__ or "")]
-    for name in service.__all__:
-        function = getattr(service, name)
-        parts += [f"### service.{name}", signature(f"service.{name}", function), docstring(function)]
-    for module, name in RETURNED:
-        cls = getattr(importlib.import_module(module), name)
-        parts += [f"## {name}", f"`{module}.{name}`", docstring(cls), "\n".join(_attributes(cls)), *_members(cls)]
+    """Every name of ``tandem_skills``, and what its functions return."""
+    ours = {name: getattr(tandem_skills, name) for name in tandem_skills.__all__}
+    parts = ["# Python API", "Made from the docstrings. `import tandem_skills as tandem`", "## Functions"]
+    for name, function in ours.items():
+        if inspect.isfunction(function):
+            parts += [f"### tandem.{name}", signature(f"tandem.{name}", function), docstring(function)]
+    for title, classes in (
+        ("Classes", [each for each in ours.values() if isinstance(each, type)]),
+        ("What functions return", [getattr(importlib.import_module(module), name) for module, name in RETURNED]),
+    ):
+        parts.append(f"## {title}")
+        for cls in classes:
+            parts += [f"### {cls.__name__}", docstring(cls), "\n".join(_attributes(cls)), *_members(cls)]
+    parts += ["## tandem.errors", docstring(tandem_skills.errors)]
+    errors = [each for each in vars(tandem_skills.errors).values() if inspect.isclass(each)]
+    known = [each for each in errors if issubclass(each, Exception)]
+    parts.append("\n".join(f"- `{each.__name__}`: {first_line(each)}" for each in known))
     return "\n\n".join(filter(None, parts)) + "\n"
 
 
@@ -207,7 +221,7 @@ def _members(cls: type) -> Iterator[str]:
             function = member.fget if isinstance(member, property) else member
             if function is not None and function.__doc__:
                 called = signature(name, function) if inspect.isfunction(member) else ""
-                yield "\n\n".join(filter(None, (f"### {cls.__name__}.{name}", called, docstring(function))))
+                yield "\n\n".join(filter(None, (f"#### {cls.__name__}.{name}", called, docstring(function))))
 
 
 def signature(name: str, function: Callable[..., object]) -> str:
@@ -251,3 +265,10 @@ def prose(text: str) -> str:
     """Text of a docstring or an option as one line of Markdown."""
     text = re.sub(r":class:`~?([^`]*)`", r"`\1`", text).replace("``", "`")
     return cell(re.sub(r"(?<!`)<(\w+)>", r"`<\1>`", " ".join(text.split())))
+
+
+if __name__ == "__main__":
+    for name, page in pages().items():
+        path = ROOT / "docs" / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(page, encoding="utf-8")

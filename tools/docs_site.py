@@ -1,4 +1,4 @@
-"""The docs site: ``python -m tools.docs_site`` builds it from ``docs/`` and the code. A link to nothing is an error.
+"""The docs site: ``python -m tools.docs_site`` builds it from ``docs/``. A link to nothing is an error.
 
 Pages link to each other as they lie in the repository. Here they are copied to one place, with links that fit there: to
 another page, to a picture or a recorded result. A source file is no part of the site, and is named by its path.
@@ -18,7 +18,6 @@ from typing import Any
 
 from benchmarks.measuring import ROOT, one_line_errors
 from service.base.errors import TandemError
-from tools import docs_reference
 
 OUTSIDE = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "deploy/README.md": "deploy.md"}
 """Pages of the site that do not lie in ``docs/``."""
@@ -55,14 +54,11 @@ def stage(out: Path, root: Path = ROOT) -> None:
     """Write what the generator reads: pages, the files they link to, its settings."""
     places = {root / source: page for source, page in OUTSIDE.items()}
     places |= {path: str(path.relative_to(root / "docs")) for path in sorted((root / "docs").rglob("*.md"))}
-    generated = docs_reference.pages()
-    known = places | {root / "docs" / page: page for page in generated}
     texts = {page: (path, path.read_text(encoding="utf-8")) for path, page in places.items()}
-    texts |= {page: (root / "docs" / page, text) for page, text in generated.items()}
     for page, (source, text) in texts.items():
         target = out / "docs" / page
         target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text(_relinked(text, source, page, known, root, out / "docs"), encoding="utf-8")
+        target.write_text(_relinked(text, source, page, places, root, out / "docs"), encoding="utf-8")
     settings = (root / "docs" / "zensical.toml").read_text(encoding="utf-8")
     (out / "zensical.toml").write_text(_with_navigation(settings, set(texts)), encoding="utf-8")
 

@@ -60,7 +60,7 @@ def main() -> None:
 def build_wheel(directory: Path) -> Path:
     """Build the wheel of this checkout into a directory."""
     source = directory / "source"
-    for name in ("service", "configs"):
+    for name in ("service", "tandem_skills", "configs"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)

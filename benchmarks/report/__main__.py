@@ -27,7 +27,7 @@ from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
 
 FILES = ("env_throughput", "throughput", "world_speed", "deployed", "mutation", "scaling", "scaling_box", "robots",
-         "transfer", "transfer_champion")  # fmt: skip
+         "transfer", "transfer_champion", "demo")  # fmt: skip
 """Names of the recorded files of which there is one each."""
 PAGES = {
     "results/pretraining.md": ("skill", "seeds", "champion", "tasks", "curves", "curriculum", "coverage", "throughput"),
@@ -40,6 +40,8 @@ PAGES = {
     "results/README.md": ("throughput", "mutation"),
     "../README.md": ("headline",),
     "scaling.md": ("box",),
+    "hardware.md": ("demo",),
+    "own_task.md": ("learned",),
 }
 """Blocks of every page that are made anew."""
 ABOUT_THE_RECIPE = ("results/pretraining.md", "scaling.md")
@@ -108,6 +110,7 @@ class Report:
             "results/comparison.md": self.comparison_blocks(trials, longer),
             "downstream.md": headline,
             "../README.md": headline,
+            "own_task.md": {"learned": [measured.own_task_table(read_all(self._results / "own_task"))]},
             "scaling.md": {
                 "box": [scaling.box_block(found.get("scaling_box", found["scaling"]))],
             },
@@ -194,6 +197,7 @@ def measured_blocks(found: Results) -> dict[str, Blocks]:
             name: [transfer.transfer_table(found[name]), transfer.transfer_words(found[name])]
             for name in PAGES["results/transfer.md"]
         },
+        "hardware.md": {"demo": [measured.demo_table(found["demo"]), measured.demo_words(found["demo"])]},
         "results/README.md": {
             "throughput": [measured.ratios_block(found["env_throughput"])],
             "mutation": [measured.mutation_words(mutants), measured.mutation_table(mutants)],

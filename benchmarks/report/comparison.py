@@ -12,7 +12,7 @@ from benchmarks.report.markdown import Row, percent, table
 from benchmarks.report.results import TRIAL, Result, by_method_and_task
 from benchmarks.reproduce import Experiment
 from service.actors.evaluation import wilson_interval
-from service.envs.tasks import TASKS
+from service.envs.tasks import PAPERS, find_task
 from service.methods.task_evaluation import Rate, rate_of
 from service.methods.task_methods import METHODS
 
@@ -34,16 +34,16 @@ def comparison_table(results: Sequence[Result]) -> str:
     of = by_method_and_task(results)
     rows: list[Row] = []
     for method, rates in PAPER.items():
-        found = [of.get((method, task), []) for task in TASKS]
-        cells = [_cell(seeds, rates[task]) for seeds, task in zip(found, TASKS, strict=True)]
+        found = [of.get((method, task), []) for task in PAPERS]
+        cells = [_cell(seeds, rates[task]) for seeds, task in zip(found, PAPERS, strict=True)]
         counts = sorted({len(seeds) for seeds in found if seeds})
         rows.append((METHODS[method].title, *cells, " to ".join(map(str, counts)) or "0"))
-    return table(("", *(task.title for task in TASKS.values()), "our seeds"), rows)
+    return table(("", *(find_task(task).title for task in PAPERS), "our seeds"), rows)
 
 
 def longer_table(results: Sequence[Result], longer: Sequence[Result]) -> str:
     """Success after the env steps of the table and after those of longer trials, where there are such."""
-    tasks = [task for task in TASKS if any(each[TRIAL]["task"] == task for each in longer)]
+    tasks = [task for task in PAPERS if any(each[TRIAL]["task"] == task for each in longer)]
     of, of_longer = by_method_and_task(results), by_method_and_task(longer)
     rows: list[Row] = []
     for method in METHODS:
@@ -51,7 +51,7 @@ def longer_table(results: Sequence[Result], longer: Sequence[Result]) -> str:
         if any(after for _, after in pairs):
             cells = [f"{_mean(before)} to {_mean(after)} ({len(after)})" if after else "" for before, after in pairs]
             rows.append((METHODS[method].title, *cells))
-    return table(("", *(TASKS[task].title for task in tasks)), rows)
+    return table(("", *(find_task(task).title for task in tasks)), rows)
 
 
 def distances_table(results: Sequence[Result]) -> str:
@@ -149,11 +149,11 @@ def headline_table(results: Sequence[Result]) -> str:
             if len(found) == 1:
                 words = title if len(names) == 1 else f"{title}: {METHODS[found[0]].title}"
             rows.append(
-                (words, *(_best([rates[name, task] for name in found if (name, task) in rates]) for task in TASKS))
+                (words, *(_best([rates[name, task] for name in found if (name, task) in rates]) for task in PAPERS))
             )
     rows.append(("*the best of the paper*", *(f"*{percent(rate)} ({_PAPER_SEEDS})*" for rate in BEST.values())))
     words = "Success at the last step, the mean of the seeds; in brackets how many seeds."
-    return f"{table(('', *(task.title for task in TASKS.values())), rows)}\n\n{words}"
+    return f"{table(('', *(find_task(task).title for task in PAPERS)), rows)}\n\n{words}"
 
 
 def _best(rates: Sequence[Rate]) -> str:

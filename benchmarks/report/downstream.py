@@ -14,7 +14,7 @@ from benchmarks.report.results import TRIAL, Result, by_method_and_task
 from benchmarks.run_files import steps_until
 from service.base.errors import TandemError
 from service.base.files import write_atomic
-from service.envs.tasks import HARD_TASKS, TASKS, find_task
+from service.envs.tasks import PAPERS, TASKS, find_task
 from service.media.figures import BLUE, FAINT, GREEN, ORANGE, new_figure, save, style_axes
 from service.methods.task_evaluation import rate_of
 from service.methods.task_methods import METHODS
@@ -95,7 +95,7 @@ def write_page(results: Sequence[Result]) -> str:
 
 def _harder(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
     """The section on harder tasks."""
-    tasks = [name for name in HARD_TASKS if any(task == name for _, task in of)]
+    tasks = [name for name in TASKS[len(PAPERS) :] if any(task == name for _, task in of)]
     return (
         "\n## A harder start and cube\n",
         "The end effector starts 20 cm above the table instead of 8, and the cube has 1 kg instead of 0.1 and half the "
@@ -122,7 +122,7 @@ def methods_table(
     of: Mapping[tuple[str, str], Seeds],
     text: Callable[[Seeds], str],
     *,
-    tasks: Sequence[str] = tuple(TASKS),
+    tasks: Sequence[str] = PAPERS,
     paper: bool = False,
 ) -> str:
     """A row per method that has a result, and a text per task; below it, if asked for, the paper's."""
@@ -139,10 +139,10 @@ def methods_table(
 
 
 def _paper_row(title: str, rates: Mapping[str, float]) -> Sequence[str]:
-    return title, *(f"*{100 * rates[task]:.0f} %*" for task in TASKS)
+    return title, *(f"*{100 * rates[task]:.0f} %*" for task in PAPERS)
 
 
-def _markdown(rows: Sequence[Row], tasks: Iterable[str] = TASKS) -> str:
+def _markdown(rows: Sequence[Row], tasks: Iterable[str] = PAPERS) -> str:
     return table(("", *(find_task(name).title for name in tasks)), rows) + "\n"
 
 
@@ -174,7 +174,7 @@ def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
     rows = []
     for method in composing:
         own, others = [METHODS[method].title], ["*best from scratch*"]
-        for task in TASKS:
+        for task in PAPERS:
             seeds = of.get((method, task), [])
             level = FINAL_SHARE * float(np.mean([each["evaluation"]["success_last"] for each in seeds] or [0.0]))
             until = _mean_until(seeds, level)
@@ -223,7 +223,7 @@ def draw_table(results: Sequence[Result], path: Path) -> Path:
     """
     of, lines = by_method_and_task(results), dict[str, "Line2D"]()
     run = {task for _, task in of}
-    tasks = [name for name in (*TASKS, *HARD_TASKS) if name in run]
+    tasks = [name for name in TASKS if name in run]
     rows = max(1, math.ceil(len(tasks) / 3))
     legend_rows = max(1, math.ceil(len({method for method, _ in of}) / _LEGEND_COLUMNS))
     above_inch = 1.0 + 0.22 * legend_rows

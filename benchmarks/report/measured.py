@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from statistics import median
 from typing import Any
 
 from benchmarks.report.markdown import cell, measured_on, percent, table
@@ -103,6 +104,52 @@ def speed_words(result: Result) -> str:
         f"The Panda's worlds make {ratios} worlds times as many env steps in a CPU second as before robots were "
         f"descriptions: commit `{new}` by `{old}`, random actions in the recipe's world, one thread, median of "
         f"{num_pairs} pairs in turn. On {where['num_cpus']} cores of {where['cpu']}, {where['time'][:10]}."
+    )
+
+
+def own_task_table(trials: Mapping[str, Result]) -> str:
+    """A user's task: each method with its success and its time."""
+    rows = []
+    for trial in sorted(trials.values(), key=lambda each: float(each["env_steps"])):
+        found, there = trial["evaluation"], next((at for at in trial["curve"] if at["success_last"] >= 0.95), None)
+        rows.append(
+            (
+                f"`{trial['cell']['method']}`",
+                f"{trial['env_steps']:,}",
+                f"{trial['wall_s'] / 60:.1f}" if trial["env_steps"] else "",
+                f"{there['wall_s'] / 60:.1f}" if there else "",
+                f"{percent(found['success_last'], 1)} of {found['num_episodes']:,}",
+                f"{percent(found['success_last_low'], 1)} to {percent(found['success_last_high'], 1)}",
+            )
+        )
+    head = ("method", "env steps", "minutes", "first 95 % of 100 after, minutes", "success", "95 % interval")
+    return table(head, rows)
+
+
+def demo_table(result: Result) -> str:
+    """What became of the demo, by seed."""
+    rows = [
+        (
+            str(run["seed"]),
+            "four of five goals, twice in a row" if run["made_it"] else "the time was over",
+            f"{run['learning_minutes']:.1f}",
+            f"{run['minutes']:.1f}",
+            f"{run['env_steps'] / 1e6:.2f} M",
+            percent(run["curve"][-1][2]),
+        )
+        for run in result["runs"]
+    ]
+    return table(("seed", "ended by", "minutes of learning", "in all", "env steps", "last evaluation"), rows)
+
+
+def demo_words(result: Result) -> str:
+    """How many seeds made it, and what watching costs."""
+    made, cost = [run["made_it"] for run in result["runs"]], result["cost"]
+    ratios = [alone / watched for alone, watched in zip(cost["alone_s"], cost["watched_s"], strict=True)]
+    return (
+        f"{sum(made)} of {len(made)} seeds made it within eight minutes. With somebody who watches, and evaluations "
+        f"every 60 updates, the demo makes {median(ratios):.2f} times the env steps/s of the recipe alone (median of "
+        f"{len(ratios)} pairs of runs; {min(ratios):.2f} to {max(ratios):.2f}).{measured_on(result['machine'])}"
     )
 
 

@@ -11,7 +11,7 @@ from benchmarks.controls import CONTROLS, OURS, TASKS
 from benchmarks.report.markdown import Row, millions, percent, table
 from benchmarks.report.recipe import differences
 from benchmarks.run_files import RANDOM, STAGES, Run, mean_share, unthin
-from service.envs.tasks import TASKS as DOWNSTREAM
+from service.envs.tasks import find_task
 
 METHODS = {"ours": "ours", "metra": "METRA", "lsd": "LSD", "dads": "DADS", "diayn": "DIAYN"}
 """Names in tables and pictures by recorded method, in the order of rows."""
@@ -60,7 +60,7 @@ def coverage_table(runs: Sequence[Run]) -> str:
 def controls_table(runs: Sequence[Run]) -> str:
     """A row for each control: its Bob on random goals, then his primitives downstream."""
     head = ("goals proposed by", "seeds", "Bob's env steps", "all env steps", "updates", *_EVALUATED,
-            *(DOWNSTREAM[task].title for task in TASKS))  # fmt: skip
+            *(find_task(task).title for task in TASKS))  # fmt: skip
     rows = []
     for name in CONTROLS:
         seeds = sorted((run for run in runs if run["control"] == name), key=lambda run: int(run["config"]["seed"]))

@@ -10,14 +10,17 @@ import numpy as np
 
 from service.base.liveness import count_work
 from service.base.progress import doing
-from service.base.types import FloatArray, Metrics, StateArray
+from service.base.types import BoolArray, FloatArray, Metrics, StateArray
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, bob_observation
-from service.envs.sampling import GoalKind, draw_goals
+from service.envs.rules import Rules
+from service.envs.sampling import GoalKind
+from service.envs.task import Task
 
-Observer = Callable[[WorldBatch, StateArray], None]
-"""Called with the worlds and their (N, 3) goals, metres, at the start and after each step."""
+Observer = Callable[[WorldBatch, StateArray, BoolArray], None]
+"""Called with the worlds, their (N, 3) goals, metres, and (N,) whether they are solved, at the start and after each
+step."""
 
 EVALUATED_GOALS: tuple[GoalKind, ...] = ("table", "air", "mixed")
 """Kinds of goals on which a run evaluates its Bob."""
@@ -52,13 +55,13 @@ class Evaluation:
     num_episodes: int
     num_steps: int
     success_last: float
-    """Share within the success distance at the last step."""
+    """Share that is solved at the last step: within the success distance, or as the task says."""
     success_last_low: float
     """Lower end of the 95 % Wilson interval of ``success_last``."""
     success_last_high: float
     """Upper end of that interval."""
     success_ever: float
-    """Share within the success distance after any step."""
+    """Share that is solved after any step."""
     mean_distance_m: float
     """Mean distance to the goal at the last step."""
 
@@ -70,7 +73,7 @@ class Evaluation:
 def evaluate(
     policy: DeterministicPolicy,
     config: WorldConfig,
-    kind: GoalKind,
+    task: Task | GoalKind,
     *,
     num_episodes: int,
     num_steps: int,
@@ -82,31 +85,32 @@ def evaluate(
 ) -> Evaluation:
     """Play ``num_episodes`` goals from fresh resets; nothing ends an episode early.
 
-    ``observe`` records the episodes; it changes nothing in the result. Goals are random of that kind, or (N, 3)
-    ``goal``, metres.
+    ``observe`` records the episodes; it changes nothing in the result. Goals are as the task draws them, or random of a
+    kind; or (N, 3) ``goal``, metres.
     """
     rng = np.random.default_rng(seed)
     with WorldBatch(config, num_episodes, num_threads=num_threads) as worlds:
         worlds.reset(rng)
+        rules = Rules(task, worlds, success_distance_m)
         if goal is None:
-            goal = draw_goals(kind, rng, config, success_distance_m, worlds.places)
-        ever = np.zeros(num_episodes, dtype=bool)
-        distance = np.zeros(num_episodes)
+            goal = rules.draw(rng)
+        ever = last = np.zeros(num_episodes, dtype=bool)
         if observe:
-            observe(worlds, goal)
-        with doing(f"evaluating on {kind} goals", num_steps * num_episodes, "env steps") as task:
+            observe(worlds, goal, rules.solved(goal))
+        with doing(f"evaluating on {rules.task.goal_kind} goals", num_steps * num_episodes, "env steps") as shown:
             for _ in range(num_steps):
                 worlds.step(policy.act_deterministic(bob_observation(worlds.positions(), goal)))
                 count_work()
-                distance = np.linalg.norm(worlds.object_position - goal, axis=1)
-                ever |= distance <= success_distance_m
+                rules.advance(goal)
+                last = rules.solved(goal)
+                ever = ever | last
                 if observe:
-                    observe(worlds, goal)
-                task.advance(num_episodes)
-    last = distance <= success_distance_m
+                    observe(worlds, goal, last)
+                shown.advance(num_episodes)
+        distance = np.linalg.norm(worlds.object_position - goal, axis=1)
     low, high = wilson_interval(int(last.sum()), num_episodes)
     return Evaluation(
-        goals=kind,
+        goals=rules.task.goal_kind,
         num_episodes=num_episodes,
         num_steps=num_steps,
         success_last=float(last.mean()),

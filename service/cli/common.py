@@ -69,7 +69,8 @@ ActsWithOption = Annotated[
     ),
 ]
 TaskOption = Annotated[
-    str | None, typer.Option(autocompletion=lambda: task_names(), help="On a task of tandem tasks, such as wall.")
+    str | None,
+    typer.Option(autocompletion=lambda: task_names(), help="On a task of tandem tasks, such as wall, or of FILE.py."),
 ]
 
 
@@ -119,11 +120,16 @@ def choose(option: str, name: str, known: Iterable[str]) -> str:
     return name
 
 
+RunCodeOption = Annotated[
+    bool, typer.Option("--run-task-code", help="Run the code that a published policy's own task brings.")
+]
+
+
 def task_names() -> list[str]:
     """What the shell completes."""
-    from service.envs.tasks import HARD_TASKS, TASKS
+    from service.envs.tasks import TASKS
 
-    return [*TASKS, *HARD_TASKS]
+    return list(TASKS)
 
 
 def what_is_meant(reference: str | None, primitives: str | None) -> tuple[str, str | None]:

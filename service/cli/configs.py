@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from service.base.errors import TandemError, did_you_mean
+from service.base.user_code import parse_reference
 from service.cli.common import CommandGroup, JsonOption, print_json, print_table, task_names
 from service.config.recipes import DEFAULT_RECIPE, find_file, first_comment, recipes, robots
 
@@ -17,6 +18,11 @@ configs_app = typer.Typer(name="configs", help="Recipes and robots that come wit
 def targets() -> list[str]:
     """Names for ``tandem train NAME``; the shell completes them."""
     return [*recipes(), *task_names()]
+
+
+def is_task(what: str) -> bool:
+    """Whether it names a task, of ours or in a file of a user's."""
+    return what in task_names() or parse_reference(what) is not None
 
 
 def named(what: str | None, method: str | None, primitives: str | None) -> tuple[Path | None, list[str]]:
@@ -29,7 +35,7 @@ def named(what: str | None, method: str | None, primitives: str | None) -> tuple
     from service.methods.task_methods import METHODS as OF_TASKS
 
     known = targets()
-    if what in task_names():
+    if what is not None and is_task(what):
         if method in OF_TASKS and method not in METHODS:
             raise TandemError(f"{method} learns nothing: measure it by tandem evaluate --task {what} --method {method}")
         chosen = [f"task={what}", f"method={method or 'ours'}"]
@@ -74,17 +80,17 @@ def methods(as_json: JsonOption = False) -> None:
             what = "a task" if name in METHODS else "nothing"
             rows.append({"name": name, "learns": what, "about": OF_TASKS[name].description})
         else:
-            about = (find_class(name).__doc__ or "").partition("\n")[0]
+            about = (find_class(name, {}).__doc__ or "").partition("\n")[0]
             rows.append({"name": name, "learns": "pre-training", "about": about.rstrip(".")})
     _show(rows, as_json)
 
 
 def tasks(as_json: JsonOption = False) -> None:
     """List the tasks, for tandem train TASK, and for --task of the commands that know tasks."""
-    from service.envs.tasks import HARD_TASKS, TASKS
+    from service.envs.tasks import TASKS, find_task
 
-    known = {**TASKS, **HARD_TASKS}
-    _show([{"name": name, "title": task.title, "about": task.description} for name, task in known.items()], as_json)
+    known = map(find_task, TASKS)
+    _show([{"name": task.name, "title": task.title, "about": task.description} for task in known], as_json)
 
 
 def _show(rows: list[dict[str, str]], as_json: bool) -> None:

@@ -16,6 +16,7 @@ from service.cli.common import (
     JsonOption,
     QuietOption,
     ReferenceArgument,
+    RunCodeOption,
     SourceOption,
     TaskOption,
     choose,
@@ -51,9 +52,7 @@ def evaluate(
     task: TaskOption = None,
     method: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME", help="Of a task, one that learns nothing: asp-only, idle, lsd-zero-shot or metra-zero-shot."
-        ),
+        typer.Option(metavar="NAME", help="Of a task, one that learns nothing: asp-only, idle, or METHOD-zero-shot."),
     ] = None,
     goals: Annotated[
         str | None,
@@ -62,7 +61,9 @@ def evaluate(
         ),
     ] = None,
     episodes: Annotated[int, typer.Option(help="Number of random goals.", min=1)] = 300,
-    steps: Annotated[int, typer.Option(help="Steps an episode, 25 a second.", min=1)] = 50,
+    steps: Annotated[
+        int | None, typer.Option(help="Steps an episode, 25 a second. Default: its task's, or 50.", min=1)
+    ] = None,
     seed: _Seed = 0,
     overrides: Annotated[
         list[str] | None,
@@ -75,6 +76,7 @@ def evaluate(
     primitives: ActsWithOption = None,
     as_json: JsonOption = False,
     registry: SourceOption = SOURCE,
+    run_task_code: RunCodeOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Measure on random goals, from fresh resets and without noise, beside a policy that does nothing.
@@ -91,13 +93,13 @@ def evaluate(
         from service.config import changed_config
         from service.envs.observations import layouts
         from service.envs.sampling import GOAL_KINDS
-        from service.envs.tasks import find_task
         from service.methods.task_evaluation import FINAL_SEED, numbers_of
         from service.registry.loading import load
 
         asked = None if goals is None else choose("--goals", goals, GOAL_KINDS)
-        trained = load(reference, registry, primitives).on(task)
+        trained = load(reference, registry, primitives, run_task_code=run_task_code).on(task)
     players, on = _players(trained, method), trained.task
+    steps = steps or (50 if on is None else on.episode_steps)
     for option, value in (("--method", method), ("--out", out)):
         if value is not None and on is None:
             raise TandemError(f"{option} is for a task: name one by --task, such as --task push")
@@ -107,8 +109,8 @@ def evaluate(
         raise TandemError(f"--out {out} is there already: name another file, or move it away")
     config = changed_config(trained.config, overrides or ())
     world, distance_m = replace(trained, config=config).world, trained.success_distance_m
-    kind = cast("GoalKind", asked or ("mixed" if on is None else trained.goals))
-    of, first_seed = ("", seed) if on is None else (f" of {find_task(on).title}", seed + FINAL_SEED)
+    tried = trained.on_goals(cast("GoalKind | None", asked))
+    of, first_seed = ("", seed) if on is None else (f" of {on.title}", seed + FINAL_SEED)
     seen, known = (list(layouts(each.world).positions.columns) for each in (config, trained.config))
     if seen != known:
         more = ", ".join(sorted(set(seen) ^ set(known)))
@@ -118,7 +120,7 @@ def evaluate(
         )
     rows = {
         name: run(
-            player, world, kind,
+            player, world, tried,
             num_episodes=episodes, num_steps=steps, seed=first_seed, success_distance_m=distance_m,
         )
         for name, player in players.items()
@@ -127,9 +129,11 @@ def evaluate(
         _write_result(out, trained, method, seed, numbers_of(next(iter(rows.values()))))
     if as_json:
         found = {name: row.as_dict() for name, row in rows.items()}
-        print_json(found if on is None else {"task": on, **found})
+        print_json(found if on is None else {"task": on.name, **found})
         return
-    typer.echo(f"{episodes} random goals{of} ({kind}), {steps} steps, within {100 * distance_m:g} cm")
+    what = f"within {100 * distance_m:g} cm" if tried.success is None else "success as the task says"
+    drawn = "its own" if callable(tried.goals) else tried.goals
+    typer.echo(f"{episodes} random goals{of} ({drawn}), {steps} steps, {what}")
     width = max(24, *map(len, rows))
     for name, row in rows.items():
         typer.echo(
@@ -167,7 +171,7 @@ def _write_result(path: Path, trained: Trained, method: str | None, seed: int, n
     method = method or ("asp-only" if trained.kind == "primitives" else f"{trained.skills.method}-zero-shot")
     takes = method not in METHODS or METHODS[method].takes is not None
     result: dict[str, JsonValue] = {
-        "task": trained.task,
+        "task": None if trained.task is None else trained.task.name,
         "method": method,
         "seed": seed,
         "primitives": trained.name if takes else None,
@@ -233,6 +237,7 @@ def render(
     speed: Annotated[float, typer.Option(help="0.5: half as fast as in the world.", min=0.05, max=20)] = 1.0,
     primitives: ActsWithOption = None,
     registry: SourceOption = SOURCE,
+    run_task_code: RunCodeOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Make a film of a run's Alice beside its Bob, of a policy on goals or on its task, or of random skills."""
@@ -243,7 +248,7 @@ def render(
         from service.registry.loading import load
 
         options = film_options(size, camera, speed, out)
-        trained = load(reference, registry, primitives).on(task)
+        trained = load(reference, registry, primitives, run_task_code=run_task_code).on(task)
     if trained.kind == "skills" and trained.task is None and goals is not None:
         raise TandemError(f"--goals: {trained.label} holds skills, of which random ones are shown; leave it out")
     asked = None if goals is None else parse_goals(goals, trained.world)

@@ -13,6 +13,7 @@ from service.cli.common import (
     ActsWithOption,
     JsonOption,
     QuietOption,
+    RunCodeOption,
     SourceOption,
     loading,
     print_json,
@@ -39,6 +40,7 @@ def export(
     episodes: Annotated[int, typer.Option(help="Played for each delay that is measured.", min=1)] = 100,
     as_json: JsonOption = False,
     registry: SourceOption = SOURCE,
+    run_task_code: RunCodeOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Write a policy for use elsewhere, such as on a robot: networks, what their numbers mean, a README.
@@ -50,7 +52,7 @@ def export(
         from service.export.exporting import export as run
         from service.registry.loading import load
 
-        trained = load(policy, registry, primitives)
+        trained = load(policy, registry, primitives, run_task_code=run_task_code)
     about = run(trained, format_name, out, part=part, num_episodes=episodes)
     if as_json:
         print_json(about)
@@ -95,6 +97,7 @@ def dataset(
         if video is not None:
             check_format(video)
         trained = load(players, registry).expect("primitives", "orchestrator", by="tandem dataset")
+    trained.goal_kind  # noqa: B018 - what it plays is paid by distance alone
     config = trained.config.model_copy(update={"world": trained.world})
     if trained.alice is not None and isinstance(config, SelfPlayConfig) and goals is None:
         rounds = recording.play_rounds(config, trained.alice, trained.policy, num_rounds=episodes, seed=seed)

@@ -13,18 +13,20 @@ from service.base.errors import TandemError
 from service.base.version import __version__
 from service.cli.common import CommandGroup, QuietOption, quieten
 from service.cli.configs import configs_app, methods, tasks
+from service.cli.demo import demo
+from service.cli.doctor import doctor
 from service.cli.evaluate import coverage, evaluate, render
 from service.cli.export import dataset, export
 from service.cli.registry import publish, registry_app
 from service.cli.robot import robot_app
 from service.cli.serve import play, serve
-from service.cli.train import TrainCommand, demo, train
+from service.cli.train import TrainCommand, train
 from service.runs.signals import stop_with_parent
 
 app = typer.Typer(name="tandem", help="Robot skills, pre-trained.", cls=CommandGroup, no_args_is_help=True)
 app.command(cls=TrainCommand)(train)
 app.command("pretrain", cls=TrainCommand, help="The same as tandem train, by its name for self-play.")(train)
-for command in (demo, evaluate, coverage, render, play, dataset, export, publish, serve, methods, tasks):
+for command in (demo, evaluate, coverage, render, play, dataset, export, publish, serve, methods, tasks, doctor):
     app.command()(command)
 app.add_typer(registry_app)
 app.add_typer(robot_app)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import socket
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -18,6 +18,7 @@ from service.cli.common import (
     QuietOption,
     ReferenceArgument,
     RegistryOption,
+    RunCodeOption,
     SourceOption,
     TaskOption,
     loading,
@@ -72,19 +73,29 @@ def play(
     seed: Annotated[int, typer.Option(help="Of starts and goals.", min=0)] = 0,
     primitives: ActsWithOption = None,
     registry: SourceOption = SOURCE,
+    run_task_code: RunCodeOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Watch a live world in the browser: drag the goal, drive the primitives, see a run's Alice propose."""
+    """Watch a live world in the browser: drag the goal, drive the primitives, see a run's Alice propose.
+
+    A run that goes on is followed: its newest Bob acts, and the page says how far it is.
+    """
     reference, primitives = what_is_meant(reference, primitives)
     with loading():
         from service.registry.loading import load
+        from service.robot.play.following import Following, is_running
         from service.robot.play.server import LiveWorld
         from service.runs.signals import StopSignals
 
-        players = load(reference, registry, primitives).expect_goals("tandem play").on(task)
-    with StopSignals() as signals:
+        players = (
+            load(reference, registry, primitives, run_task_code=run_task_code).expect_goals("tandem play").on(task)
+        )
+    path = Path(reference)
+    with StopSignals() as signals, ExitStack() as stack:
+        follows = task is None and is_running(path)
+        following = stack.enter_context(closing(Following(path, registry, primitives))) if follows else None
         with loading():
-            world = LiveWorld(players, host, port, seed)
+            world = LiveWorld(players, host, port, seed, following)
         with closing(world) as live, signals.asking(lambda: None):
             typer.echo(f"{players.title}: {live.url}")
             typer.echo(

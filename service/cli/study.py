@@ -11,7 +11,7 @@ import typer
 
 from service.base.errors import ConfigError, TandemError, one_line
 from service.cli.common import REGISTRY, how_to_go_on, loading, print_table, shown, stopped, traceback_in
-from service.cli.configs import named
+from service.cli.configs import is_task, named
 from service.config.recipes import DEFAULT_RECIPE, recipes
 from service.runs.grid import SEED, Settings, check_once, name_runs, parse_grid
 
@@ -155,15 +155,15 @@ def _plan(
     ``default`` is the file of runs for which none is named.
     """
     from service.config.find import METHODS as KNOWN
-    from service.envs.tasks import HARD_TASKS, TASKS
+    from service.envs.tasks import PAPERS
     from service.methods.task_methods import METHODS
 
     given = parse_grid(grid, seeds)
     whats, methods = _words(what), _words(method)
-    whats = list(TASKS) if whats == ["all"] else whats
+    whats = list(PAPERS) if whats == ["all"] else whats
     if methods == ["all"]:  # skills are other commands, each with its own --primitives
         methods = [name for name, how in METHODS.items() if name in KNOWN and how.takes != "skills"]
-    kind = "task" if {*whats} <= {*TASKS, *HARD_TASKS} else "recipe"
+    kind = "task" if all(map(is_task, whats)) else "recipe"
     several = {key: words for key, words in ((kind, whats), ("method", methods)) if len(words) > 1}
     for key, word, words in ((kind, what, whats), ("method", method, methods)):
         check_once(str(word), words)

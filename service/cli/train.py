@@ -1,12 +1,10 @@
-"""``tandem train``, which ``tandem pretrain`` is, too, and ``tandem demo``."""
+"""``tandem train``, which ``tandem pretrain`` is, too."""
 
 from __future__ import annotations
 
 import re
-import shlex
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +13,6 @@ from typer.core import TyperCommand
 
 from service.base.errors import TandemError
 from service.cli.common import (
-    CHAMPION,
     REFERENCE,
     SOURCE,
     QuietOption,
@@ -30,7 +27,6 @@ from service.cli.common import (
     was_typed,
 )
 from service.cli.configs import named, targets
-from service.cli.evaluate import evaluate
 from service.cli.study import is_study, train_study
 from service.config.recipes import DEFAULT_RECIPE, recipes
 from service.runs.trackers import Trackers, find_factory
@@ -39,6 +35,7 @@ if TYPE_CHECKING:
     from service.cluster.ray_connection import ClusterOptions
     from service.config import Config
     from service.registry.loading import Trained
+    from service.runs.run import Ending, OnIteration
     from service.runs.train import Finished
     from service.store.run_directory import RunDirectory
 
@@ -66,7 +63,8 @@ def train(
         typer.Argument(
             metavar="RECIPE|TASK|FILE|all",
             autocompletion=targets,
-            help="A name of tandem configs, a task such as push, or a YAML file; what that leaves out has its default. "
+            help="A name of tandem configs, a task such as push or of yours in FILE.py, or a YAML file; what it leaves "
+            "out has its default. "
             f"Without: {DEFAULT_RECIPE}, or what a resumed run has. Several, such as push,wall, or all: a study.",
         ),
     ] = None,
@@ -77,7 +75,7 @@ def train(
         str | None,
         typer.Option(
             metavar="NAME|FILE.py:CLASS",
-            help="Of a task: see tandem methods; several, or all: a study. Else lsd, dads, diayn, metra.",
+            help="Of a task: see tandem methods; several, or all: a study. Else lsd, dads, diayn, metra, csf.",
         ),
     ] = None,
     primitives: Annotated[
@@ -215,57 +213,13 @@ def train(
             resolved = load_config(begun, overrides).begin(source, start)
     if publish is None:
         publish = resolved.makes != "orchestrator"
-    _train(
+    train_and_tell(
         resolved, directory, source, resume=again, publish=publish, start=start, trackers=trackers,
         cluster=cluster_options() if runtime == "ray" else None, address=address,
     )  # fmt: skip
 
 
-def demo(
-    run_dir: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/demo-N.")] = None,
-    env_steps: Annotated[
-        int, typer.Option(help="Budget; the default takes about three minutes on 2 cores.", min=1)
-    ] = 1_000_000,
-    quiet: QuietOption = False,
-) -> None:
-    """Watch a robot arm teach itself: a small pre-training from scratch, with pictures and a video."""
-    from service.config import load_config
-    from service.registry.bundled import BUNDLED
-    from service.store.run_directory import RunDirectory
-
-    paths = (Path("runs") / f"demo-{number}" for number in count(1))
-    path = run_dir or next(path for path in paths if not path.exists())
-    if RunDirectory(path).exists:
-        raise TandemError(
-            f"{path} holds a run already, and a demo begins a new one: leave --run-dir out, or name another; or "
-            f"{how_to_go_on(path, path / 'registry')}"
-        )
-    typer.echo("A robot arm is about to teach itself: Alice proposes goals, Bob learns to reach them.")
-    # Evaluated often: about 200 iterations are to give a curve of Bob on random goals, not a point.
-    overrides = [f"run.total_env_steps={env_steps}", "name=panda-cube-demo", "run.evaluation_interval=25"]
-    config = load_config(recipes()[DEFAULT_RECIPE], overrides)
-    done = _train(config, RunDirectory(path), path / "registry", resume=False)
-    rates = {
-        where: done.metrics.get(f"evaluation/{name}_success_last")
-        for name, where in (("table", "on the table"), ("air", "in the air"))
-    }
-    told = [f"{rate:.0%} of random goals {where}" for where, rate in rates.items() if rate is not None]
-    reaches = f", and now reaches {' and '.join(told)}" if told else ""
-    typer.echo(f"\nBob has practised for {done.num_env_steps:,} steps{reaches}.")
-    typer.echo(f"\nThat was a beginning. Primitives that have learned for longer come with tandem; {CHAMPION}:")
-    evaluate(CHAMPION, registry=str(BUNDLED))  # prints what the first of the next commands prints
-    commands = [
-        f"evaluate {CHAMPION} --goals mixed --episodes 300",
-        f"render   {CHAMPION} --out champion.mp4",
-        f"coverage {CHAMPION} --out champion.png",
-        f"play     {CHAMPION}",
-        shlex.join(["serve", "--runs", str(path.parent)]),
-    ]
-    typer.echo("\nLook at them, or at the run on its page, in a browser:")
-    typer.echo("\n".join(f"  tandem {command}" for command in commands))
-
-
-def _train(
+def train_and_tell(
     config: Config,
     directory: RunDirectory,
     registry: Path | str,
@@ -276,6 +230,7 @@ def _train(
     trackers: Sequence[str] = (),
     cluster: ClusterOptions | None = None,
     address: str | None = None,
+    until: OnIteration = lambda metrics: None,
 ) -> Finished:
     """Train, show how far that is, and say what came out, or how to go on."""
     with loading():
@@ -300,9 +255,10 @@ def _train(
             tracked = stack.enter_context(closing(Trackers(trackers, run_id_of(directory.path), tree)))
             progress = stack.enter_context(closing(Progress(shown())))
 
-            def tell(metrics: dict[str, float]) -> None:
+            def tell(metrics: dict[str, float]) -> Ending | None:
                 progress.show(metrics, config.run.total_env_steps)
                 tracked.log(metrics)
+                return until(metrics)
 
             done = training.train(
                 config, directory, registry,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -10,18 +10,22 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from service.base.errors import ConfigError, did_you_mean
-from service.config.find import METHODS, exact_name, find_class
+from service.base.user_code import recorded
+from service.config.find import METHODS, find_class
 from service.config.frozen import NO_KEYS, first_error
 from service.config.run import Config
 from service.config.tree import apply_override, read_yaml
 
 
-def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -> Config:
+def load_config(
+    path: Path | str | None = None, overrides: Sequence[str] = (), code: Mapping[str, str] | None = None
+) -> Config:
     """Read a run's configuration.
 
     Args:
         path: YAML file; None for the defaults.
         overrides: ``a.b=c`` strings, applied in order; the value is parsed as YAML.
+        code: texts that a run has recorded, which stand for those that the files of a user's have now.
 
     Raises:
         ConfigError: file missing or not YAML, unknown key, value out of range; one line a user can act on.
@@ -29,6 +33,8 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     tree = read_yaml(Path(path)) if path is not None else {}
     for override in overrides:
         apply_override(tree, override)
+    if code:
+        tree.setdefault("code", dict(code))
     if path is None:
         return parse_config(tree, where="the overrides")
     return parse_config(tree, where=f"{path} and the overrides" if overrides else str(path))
@@ -47,12 +53,15 @@ def parse_config(tree: dict[str, Any], *, where: str) -> Config:
     method = tree.get("method", "self-play")
     if not isinstance(method, str):
         raise ConfigError(f"{where}: method = {method!r}: expected a name")
+    given = tree.get("code")
+    code = given if isinstance(given, dict) else {}
     try:
-        kind = find_class(method)
+        texts = recorded(method, code)
+        kind = find_class(method, texts)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
-    if "method" in tree:
-        tree = {**tree, "method": exact_name(method)}
+    if texts is not code:
+        tree = {**tree, "code": texts}
     try:
         return kind.model_validate(tree)
     except ValidationError as error:
@@ -80,8 +89,17 @@ def changed_config(config: Config, overrides: Sequence[str]) -> Config:
 
 def dump_config(config: Config) -> str:
     """The resolved configuration as YAML that ``load_config`` reads back to an equal object."""
-    text: str = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+    text: str = yaml.dump(config.model_dump(mode="json"), Dumper=_Dumper, sort_keys=False)
     return text
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes texts of several lines as they are."""
+
+
+_Dumper.add_representer(
+    str, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, "|" if "\n" in text else None)
+)
 
 
 def _keys(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -100,7 +118,7 @@ def _elsewhere(keys: Sequence[tuple[str, str]], name: str) -> str:
         return f"; did you mean {' or '.join(found)}?"
     others: dict[type[Config], str] = {}  # one method of each class
     for method in METHODS:
-        if name in (other := find_class(method)).model_fields:
+        if name in (other := find_class(method, {})).model_fields:
             others.setdefault(other, method)
     return f"; it is a key of method={' and '.join(others.values())}" if others else ""
 

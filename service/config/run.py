@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
@@ -35,9 +36,12 @@ class Config(FrozenModel):
         "panda-cube", pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$", description="registry name of what it makes"
     )
     seed: int = Field(0, ge=0, le=2**32 - 1)
-    method: str = Field(description="a name of ``tandem methods``, or FILE.py:CLASS, a class of yours")
+    method: str = Field(
+        description="a name of ``tandem methods``; or FILE.py, FILE.py:CLASS or MODULE:CLASS, a class of yours"
+    )
     world: WorldConfig = WorldConfig()
     run: RunConfig = RunConfig()
+    code: Mapping[str, str] = Field({}, description="texts of files of yours that it uses; a new run records them")
 
     made_in: ClassVar[str] = ""
     """The module whose ``make`` makes the method, and whose ``begin``, if any, completes the configuration."""

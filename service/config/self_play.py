@@ -9,6 +9,7 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, PositiveInt, model_validator
 
+from service.base.user_code import parse_reference
 from service.config.frozen import FrozenModel
 from service.config.run import Config
 
@@ -86,6 +87,9 @@ class GameConfig(FrozenModel):
         return self
 
 
+GOAL_SOURCES = ("alice", "reached", "uniform", "table", "learnable")
+
+
 class GeneratorConfig(FrozenModel):
     """The task generator: which goals and opponents a round uses, and when the run is over."""
 
@@ -94,13 +98,14 @@ class GeneratorConfig(FrozenModel):
     )
     opponent_pool_size: int = Field(5, ge=1)
     opponent_interval: int = Field(10, ge=1, description="iterations between two snapshots of the players")
-    goal_source: Literal["alice", "reached", "uniform", "table", "learnable"] = Field(
+    goal_source: str = Field(
         "alice",
         description="of the goals that Bob plays besides those that Alice has just proposed. alice: her earlier ones. "
         "reached: new ones in cells to which either player has brought the object in a game, and in cells beside "
         "these, weighted by p (1 - p) of tasks like them. Controls: uniform, drawn as those of an evaluation; table, "
         "anywhere on it; learnable, uniform goals weighted by p (1 - p) (SFL, Rutherford et al. 2024). All but alice's "
-        "begin where worlds are now, and every second with the object in the hand once there are such starts",
+        "begin where worlds are now, and every second with the object in the hand once there are such starts. Or "
+        "FILE.py:CLASS, a GoalSource of yours",
     )
     replay_fraction: float = Field(
         0.0,
@@ -313,6 +318,11 @@ class SelfPlayConfig(Config):
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         generator = self.generator
+        if generator.goal_source not in GOAL_SOURCES and parse_reference(generator.goal_source) is None:
+            raise ValueError(
+                f"generator.goal_source = {generator.goal_source!r}: choose one of {', '.join(GOAL_SOURCES)}, or "
+                "FILE.py:CLASS"
+            )
         if not self.game.alice_plays and (
             generator.goal_source in ("alice", "reached") or not generator.replay_invalid
         ):

@@ -1,16 +1,31 @@
-"""Configuration of soft actor-critic, and of the baselines that discover skills by it: LSD, DIAYN, DADS and METRA."""
+"""Configuration of soft actor-critic, and of skill discovery by it: LSD, DIAYN, DADS, METRA, CSF, or a user's own."""
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, PositiveInt, model_validator
 
+from service.base.user_code import parse_reference
 from service.config.frozen import FrozenModel
 from service.config.run import Config
 from service.config.world import ObservedConfig
 
-SkillMethod = Literal["lsd", "diayn", "dads", "metra"]
+Prior = Literal["normal", "sphere", "uniform"]
+"""Of skills: N(0, I), uniform on the unit sphere, uniform in [-1, 1]."""
+ZeroShot = Literal["way", "place", "none"]
+"""The skill that leads to a goal: the way to it in the network's outputs, the outputs there, or none."""
+
+
+SKILLS_OF: Mapping[str, tuple[Prior, ZeroShot]] = {
+    "lsd": ("normal", "way"),
+    "diayn": ("normal", "place"),
+    "dads": ("uniform", "none"),
+    "metra": ("sphere", "way"),
+    "csf": ("sphere", "way"),
+}
+"""What the classes of the rewards say, for those who act without them."""
 
 
 class SACConfig(FrozenModel):
@@ -56,7 +71,11 @@ class SkillsSACConfig(SACConfig):
 class SkillsConfig(FrozenModel):
     """Skill discovery: a policy that a skill vector z steers, learned from an intrinsic reward alone."""
 
-    method: SkillMethod = Field("lsd", description="LSD, DIAYN, DADS or METRA, on the object's position alone")
+    method: str = Field(
+        "lsd", description="lsd, diayn, dads, metra or csf, on the object's position alone; or FILE.py:CLASS of yours"
+    )
+    prior: Prior = Field("normal", description="of skills; that of its method")
+    zero_shot: ZeroShot = Field("way", description="skill that leads to a goal; that of its method")
     size: int = Field(4, ge=1, description="of z; paper: 4, continuous")
     episode_steps: int = Field(50, ge=2, description="as downstream; CSD's Fetch tasks have as many")
     hidden_sizes: tuple[PositiveInt, ...] = Field(
@@ -82,6 +101,18 @@ class SkillsConfig(FrozenModel):
     replay_steps: int = Field(1_000_000, ge=1, description="env steps that are kept to learn from")
     sac: SkillsSACConfig = SkillsSACConfig()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _as_its_method_has_them(cls, values: Any) -> Any:
+        method = values.get("method", "lsd") if isinstance(values, Mapping) else None
+        if not isinstance(method, str) or method not in SKILLS_OF:
+            return values
+        said = dict(zip(("prior", "zero_shot"), SKILLS_OF[method], strict=True))
+        for key in said.keys() & values.keys():
+            if values[key] != said[key]:
+                raise ValueError(f"{key} of {method} is {said[key]}, not {values[key]!r}: leave it out")
+        return {**values, **said}
+
 
 class SkillDiscoveryConfig(Config):
     """Skill discovery: a policy that a skill vector steers, learned from an intrinsic reward alone."""
@@ -92,6 +123,20 @@ class SkillDiscoveryConfig(Config):
 
     method: Literal["skills"] = "skills"
     skills: SkillsConfig = SkillsConfig()
+
+    def as_in(self, saved: Self) -> Self:
+        """The same, with what a reward of a user's says of its skills."""
+        if self.skills.method != saved.skills.method:
+            return self
+        said = {"prior": saved.skills.prior, "zero_shot": saved.skills.zero_shot}
+        return self.model_copy(update={"skills": self.skills.model_copy(update=said)})
+
+    @model_validator(mode="after")
+    def _there_is_such_a_method(self) -> Self:
+        method = self.skills.method
+        if method not in SKILLS_OF and parse_reference(method) is None:
+            raise ValueError(f"skills.method {method!r}: choose one of {', '.join(SKILLS_OF)}, or FILE.py:CLASS")
+        return self
 
     @model_validator(mode="after")
     def _they_see_the_papers_positions(self) -> Self:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self, get_args
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from service.base.user_code import parse_reference
 from service.config.run import SUCCESS_DISTANCE_M, Config, RunConfig
-from service.config.skills import SACConfig, SkillMethod
+from service.config.skills import SKILLS_OF, SACConfig
 
-EPISODE_STEPS = 50
-"""Env steps of an episode of every task (paper: 50)."""
+_TAKE_SKILLS = (*SKILLS_OF, "any-skills")
 
 
 class TaskRunConfig(RunConfig):
@@ -31,7 +32,7 @@ class TaskConfig(Config):
     makes: ClassVar[Literal["orchestrator"]] = "orchestrator"
 
     method: str
-    task: str = Field(description="a name of ``tandem tasks``")
+    task: str = Field(description="a name of ``tandem tasks``, or FILE.py, FILE.py:NAME or MODULE:NAME, one of yours")
     primitives: str = Field(
         "panda-cube@champion",
         description="version, run or export whose primitives or skills the method takes, and in whose world it plays",
@@ -41,7 +42,6 @@ class TaskConfig(Config):
     skill_steps: int = Field(
         5,
         ge=1,
-        le=EPISODE_STEPS,
         description="env steps that a skill is held; methods with primitives act anew in each",
     )
     reward_margin_m: float = Field(
@@ -51,6 +51,7 @@ class TaskConfig(Config):
         description="while learning the object has to be this much nearer than what counts: it seldom leaves again",
     )
     task_version: int = Field(0, ge=0, description="of the task's Gymnasium name; a new run records it")
+    episode_steps: int = Field(50, ge=1, description="of the task; a new run records it")
     run: TaskRunConfig = TaskRunConfig()
 
     @property
@@ -61,11 +62,12 @@ class TaskConfig(Config):
     @property
     def hold_steps(self) -> int:
         """Env steps that an action of the learner lasts."""
-        return self.skill_steps if self.method in get_args(SkillMethod) else 1
+        return self.skill_steps if self.method in _TAKE_SKILLS else 1
 
     def as_in(self, saved: Self) -> Self:
         """The same, with the exact version of the primitives and their world, where these may be those of ``saved``."""
-        exact = {"primitives_digest": saved.primitives_digest, "task_version": saved.task_version}
+        keys = ("primitives_digest", "task_version", "episode_steps", "code")
+        exact = {key: getattr(saved, key) for key in keys}
         update: dict[str, Any] = {key: value for key, value in exact.items() if key not in self.model_fields_set}
         if "world" not in self.model_fields_set:
             update["world"] = saved.world
@@ -78,21 +80,26 @@ class TaskConfig(Config):
     def _has_a_name(cls, values: Any) -> Any:
         if not isinstance(values, Mapping) or "name" in values:
             return values
-        return {**values, "name": f"{values.get('task')}-{values.get('method')}"}
+        file = Path(str(values.get("task"))).name.lower()  # without its directory and its ending
+        task = re.sub(r"(\.py)?[^a-z0-9._]+|\.py$", "-", file).strip("-._")[:30]
+        return {**values, "name": f"{task or 'task'}-{values.get('method')}"}
 
     @model_validator(mode="after")
     def _learns_something(self) -> Self:
-        starts, episodes = self.sac.learning_starts, EPISODE_STEPS * self.sac.num_worlds
+        starts, episodes = self.sac.learning_starts, self.episode_steps * self.sac.num_worlds
         if self.run.total_env_steps <= starts:
             raise ValueError(
                 f"{self.run.total_env_steps} env steps are all uniform actions: give more than sac.learning_starts, "
                 f"{starts}"
             )
-        if self.skill_steps != type(self).model_fields["skill_steps"].default and self.method not in get_args(
-            SkillMethod
-        ):
+        length_known = parse_reference(self.task) is None or bool(self.code)
+        if length_known and self.hold_steps > self.episode_steps:
+            raise ValueError(
+                f"skill_steps {self.skill_steps}: an episode has {self.episode_steps} steps; hold it shorter"
+            )
+        if self.skill_steps != type(self).model_fields["skill_steps"].default and self.method not in _TAKE_SKILLS:
             raise ValueError(f"skill_steps is for methods that take skills, and {self.method} takes none: leave it out")
-        if self.method.endswith("-her") and starts < episodes:
+        if self.method.endswith("-her") and length_known and starts < episodes:
             raise ValueError(
                 f"sac.learning_starts = {starts}: goals are relabelled from whole episodes, so give at least "
                 f"{episodes}, one of each of {self.sac.num_worlds} worlds"

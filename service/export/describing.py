@@ -85,7 +85,7 @@ def describe(
         "format_version": 1,
         "name": trained.name if frozen is None else f"{trained.name} with {frozen.name}",
         "kind": "bob" if trained.task is None else "orchestrator",
-        "task": trained.task,  # that an orchestrator was trained for
+        "task": None if trained.task is None else trained.task.name,  # that an orchestrator was trained for
         "format": format_name,
         "made": {
             "tandem": __version__,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from service.actors.evaluation import REPORTED_SEED, DeterministicPolicy, evaluate
-from service.base.types import FloatArray, StateArray
+from service.base.types import BoolArray, FloatArray, StateArray
 from service.config import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WIDTH_CHANGE_M, WorldBatch
 from service.envs.observations import COMMAND_PREFIX, DELAY, ObservationLayout, bob_observation, layouts
@@ -39,7 +39,7 @@ def measure(trained: Trained, num_episodes: int) -> tuple[Measured, FloatArray]:
     observations: list[FloatArray] = []
     tip: list[StateArray] = []
 
-    def record(worlds: WorldBatch, goal: StateArray) -> None:
+    def record(worlds: WorldBatch, goal: StateArray, _: BoolArray) -> None:
         observations.append(bob_observation(worlds.positions(), goal))
         tip.append(worlds.ee_position.copy())
 
@@ -49,7 +49,7 @@ def measure(trained: Trained, num_episodes: int) -> tuple[Measured, FloatArray]:
         found = evaluate(
             _Late(trained.player(), steps, layout),
             trained.world,
-            trained.goals,
+            trained.tried_on,
             num_episodes=num_episodes,
             num_steps=trained.num_steps,
             success_distance_m=trained.success_distance_m,

@@ -11,18 +11,17 @@ from numpy.typing import NDArray
 
 from service.base.tensors import join_parts, split_parts
 from service.base.types import Array, Arrays, BoolArray, IntArray, StateArray
-from service.config.self_play import SelfPlayConfig
+from service.config.self_play import GOAL_SOURCES, SelfPlayConfig
 from service.envs.sampling import GoalKind, inside_obstacles, sample_goals
 from service.envs.state_layout import obstacle_places
 from service.generator.bins import GoalCells, TaskBins, in_air
 from service.generator.opponents import RoundPlan
 from service.generator.ring import Rows, join_rows
+from service.generator.sources import NUM_DRAWN, CheckedSource
 from service.generator.validity import Verdict
 
 LEARNABILITY_FLOOR = 0.01
 """Added to p (1 - p), which is at most 1/4, so solved and hopeless tasks stay drawable and measured."""
-NUM_DRAWN = 1024
-"""Goals drawn in a round for another ``goal_source`` than Alice, of which those that are played are chosen."""
 MIN_REPLAY_GOALS = 64
 """Goals the buffer must hold before any is replayed: fewer would be played over and over."""
 _ARRAYS = ("learnability", "novelty", "success_rate", "coverage", "near_reached")
@@ -133,6 +132,11 @@ class GeneratorSnapshot:
             tasks.give(choice, np.flatnonzero(replayed), rng)
         return choice
 
+    @property
+    def _own_source(self) -> CheckedSource:
+        rates = float(self.coverage), float(self.success_rate)
+        return CheckedSource(self.config, *rates, lambda goal: self.near_reached[self.cells.index(goal)])
+
     def state(self) -> Arrays:
         """All arrays by flat names."""
         arrays: Arrays = {name: getattr(self, name) for name in _ARRAYS}
@@ -177,16 +181,21 @@ class GeneratorSnapshot:
     def _new_goals(self, rng: np.random.Generator) -> StateArray:
         """(M, 3) goals that Alice did not propose, metres."""
         source = self.config.generator.goal_source
+        if source not in GOAL_SOURCES:
+            return self._own_source.goals(rng)
         kind: GoalKind = "table" if source == "table" else "mixed"
         goal = sample_goals(kind, rng, NUM_DRAWN, self.config.world, self.config.game.success_distance_m)
         return goal[self.near_reached[self.cells.index(goal)]] if source == "reached" else goal
 
     def _weight(self, goal: StateArray, start_state: StateArray, start_position: StateArray) -> StateArray:
-        """(M,) weights of tasks: what Bob can learn from each, or all alike where the source asks for that."""
-        if self.config.generator.goal_source in ("alice", "reached", "learnable"):
-            weight: StateArray = self.learnability[self.tasks.index(goal, start_position, start_state)]
+        """(M,) weights of tasks: what Bob can learn from each, all alike, or what a user's source says."""
+        source = self.config.generator.goal_source
+        if source in ("uniform", "table"):
+            return np.ones(len(goal))
+        weight: StateArray = self.learnability[self.tasks.index(goal, start_position, start_state)]
+        if source in GOAL_SOURCES:
             return weight + LEARNABILITY_FLOOR
-        return np.ones(len(goal))
+        return self._own_source.weights(goal, start_position, weight)
 
     def _is_task(self, goal: StateArray, start_state: StateArray, start_position: StateArray) -> BoolArray:
         """(M,) whether the object has to be moved, and can be: a closed gripper lifts nothing, obstacles take room."""

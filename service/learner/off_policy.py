@@ -43,7 +43,9 @@ class Step(NamedTuple):
     ended: BoolArray
     """(N,) it was the last of its episode."""
     success: BoolArray
-    """(N,) the goal was reached, where ``ended``."""
+    """(N,) the task was solved, where ``ended``."""
+    view: FloatArray | None
+    """(N, V) ``View.rows`` that the actions led to, where success or reward are the task's own functions."""
 
 
 class TabletopWorlds(ABC):
@@ -100,6 +102,7 @@ class TabletopWorlds(ABC):
             reward.astype(np.float32),
             ended,
             success,
+            info.get("view"),
         )
         self._see(observation)
         self.previous = np.where(ended[:, None], self.positions, step.positions)

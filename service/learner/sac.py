@@ -31,9 +31,11 @@ class Batch(NamedTuple):
     actions: FloatArray
     """(B, A) in [-1, 1]."""
     rewards: FloatArray
-    """(B,)"""
+    """(B,), or (B, F) features."""
     next_inputs: FloatArray
     """(B, I)"""
+    weights: FloatArray | None = None
+    """(B, F) of the features: their product is what is paid."""
 
 
 class SACLearner:
@@ -45,14 +47,24 @@ class SACLearner:
         num_actions: A.
         config: how to learn.
         seed: of the critics' first parameters and of the noise.
+        num_features: F. With them, critics learn successor features (Barreto et al. 2017), without what
+            entropy is worth later, as in CSF (arXiv 2412.08021).
     """
 
-    def __init__(self, actor: nn.Module, num_inputs: int, num_actions: int, config: SACConfig, seed: int) -> None:
+    def __init__(
+        self,
+        actor: nn.Module,
+        num_inputs: int,
+        num_actions: int,
+        config: SACConfig,
+        seed: int,
+        num_features: int | None = None,
+    ) -> None:
         self.config, self.actor, self.num_actions = config, actor, num_actions
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.critics, self._targets = (
-                Critics(num_inputs, num_actions, config.hidden_sizes, layer_norm=config.critic_layer_norm)
+                Critics(num_inputs, num_actions, config.hidden_sizes, num_features, layer_norm=config.critic_layer_norm)
                 for _ in range(2)
             )
         self._targets.load_state_dict(self.critics.state_dict())
@@ -85,7 +97,7 @@ class SACLearner:
         Returns:
             Means over the steps.
         """
-        columns = [torch.from_numpy(rows).split(self.config.batch_size) for rows in batch]
+        columns = [torch.from_numpy(rows).split(self.config.batch_size) for rows in batch if rows is not None]
         found = torch.stack([self._step(*part) for part in zip(*columns, strict=True)]).mean(0).tolist()
         names = "critic_loss", "actor_loss", "entropy_coefficient", "entropy"
         return dict(zip(names, found, strict=True))
@@ -123,18 +135,28 @@ class SACLearner:
         parts["count"] = {"averaged": self._num_averaged}
         return {f"{part}/{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}
 
-    def _step(self, inputs: Tensor, actions: Tensor, rewards: Tensor, next_inputs: Tensor) -> Tensor:
+    def _step(
+        self, inputs: Tensor, actions: Tensor, rewards: Tensor, next_inputs: Tensor, weights: Tensor | None = None
+    ) -> Tensor:
         alpha = self._log_alpha.detach().exp()
         with torch.no_grad():
             mean, log_std = self.actor(next_inputs)
             next_actions, next_log_prob = sample_actions(mean, log_std, self._noise(mean))
-            following = self._targets(next_inputs, next_actions).amin(0) - alpha * next_log_prob
+            following = self._targets(next_inputs, next_actions)
+            if weights is None:
+                following = following.amin(0) - alpha * next_log_prob
+            else:  # the features of the critic that thinks less of them
+                lower = (following * weights).sum(-1).argmin(0)
+                following = following[lower, torch.arange(len(lower))]
             target = rewards + self.config.gamma * following
-        critic_loss = 0.5 * (self.critics(inputs, actions) - target).square().mean(1).sum()
+        errors = (self.critics(inputs, actions) - target).square()
+        critic_loss = 0.5 * (errors.mean(1) if weights is None else errors.mean((1, 2))).sum()
         self._descend("critics", critic_loss)
         mean, log_std = self.actor(inputs)
         new_actions, log_prob = sample_actions(mean, log_std, self._noise(mean))
-        actor_loss = (alpha * log_prob - self.critics(inputs, new_actions).amin(0)).mean()
+        values = self.critics(inputs, new_actions)
+        values = values if weights is None else (values * weights).sum(-1)
+        actor_loss = (alpha * log_prob - values.amin(0)).mean()
         self._descend("actor", actor_loss)
         entropy = -log_prob.detach().mean()
         if self.config.learn_entropy_coefficient:

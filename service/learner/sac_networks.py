@@ -44,19 +44,27 @@ class GaussianActor(nn.Module):
 
 
 class Critics(nn.Module):
-    """Two networks that each say what an action is worth."""
+    """Two networks that each say what an action is worth, or F features of it."""
 
     def __init__(
-        self, num_inputs: int, num_actions: int, hidden_sizes: Sequence[int], *, layer_norm: bool = False
+        self,
+        num_inputs: int,
+        num_actions: int,
+        hidden_sizes: Sequence[int],
+        num_features: int | None = None,
+        *,
+        layer_norm: bool = False,
     ) -> None:
         super().__init__()
-        sizes = (num_inputs + num_actions, *hidden_sizes, 1)
+        sizes = (num_inputs + num_actions, *hidden_sizes, num_features or 1)
+        self._has_features = num_features is not None
         self.first, self.second = (make_layers(*sizes, layer_norm=layer_norm) for _ in range(2))
 
     def forward(self, inputs: Tensor, actions: Tensor) -> Tensor:
-        """(2, N) values of (N, A) actions at (N, I) inputs."""
+        """(2, N) values of (N, A) actions at (N, I) inputs, or (2, N, F) features."""
         rows = torch.cat((inputs, actions), dim=1)
-        return torch.cat((self.first(rows), self.second(rows)), dim=1).T
+        first, second = self.first(rows), self.second(rows)
+        return torch.stack((first, second)) if self._has_features else torch.cat((first, second), dim=1).T
 
 
 def sample_actions(mean: Tensor, log_std: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:

@@ -24,6 +24,7 @@ from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.sampling import GoalKind
+from service.envs.task import Task
 from service.generator.bins import in_air
 from service.generator.generator import TaskGenerator
 from service.generator.opponents import Opponents
@@ -115,7 +116,7 @@ def record_rounds(
 def record_episodes(
     bob: DeterministicPolicy,
     config: WorldConfig,
-    kind: GoalKind,
+    task: Task | GoalKind,
     *,
     num_episodes: int,
     num_steps: int,
@@ -127,14 +128,13 @@ def record_episodes(
     kept: list[tuple[StateArray, StateArray, BoolArray]] = []
     acting = _Keeping(bob)
 
-    def keep(worlds: WorldBatch, goal: StateArray) -> None:
-        reached = np.linalg.norm(worlds.object_position - goal, axis=1) <= success_distance_m
+    def keep(worlds: WorldBatch, goal: StateArray, reached: BoolArray) -> None:
         kept.append((worlds.states.copy(), goal, reached))
 
     evaluate(
         acting,
         config,
-        kind,
+        task,
         num_episodes=num_episodes,
         num_steps=num_steps,
         success_distance_m=success_distance_m,
@@ -161,7 +161,7 @@ def record_on_goals(
     return record_episodes(
         trained.player(),
         trained.world,
-        goals if isinstance(goals, str) else trained.goals,
+        trained.on_goals(goals if isinstance(goals, str) else None),
         num_episodes=num_episodes if points is None else len(points),
         num_steps=trained.num_steps,
         success_distance_m=trained.success_distance_m,

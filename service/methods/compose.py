@@ -142,7 +142,7 @@ class ComposePrimitives(
 
     Args:
         env: acts by the four numbers of ``TabletopEnv``, and shows the P positions that primitives see.
-        primitives: what ``service.load`` returns, or its ``.primitives``. Never changed.
+        primitives: what ``tandem_skills.load`` returns, or its ``.primitives``. Never changed.
         positions: takes the (P,) positions (``service.envs.observations``) out of an observation. By default they are
             the observation itself, or its entry ``observation``.
         residual: above 0, the action has four more numbers, which are added to the composition, times this.

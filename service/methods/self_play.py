@@ -20,9 +20,11 @@ from service.actors.evaluation import EVALUATED_GOALS
 from service.actors.rollout import Rollout, from_arrays, to_arrays
 from service.base.errors import TandemError
 from service.base.types import Metrics
-from service.config.self_play import SelfPlayConfig
+from service.base.user_code import recorded
+from service.config.self_play import GOAL_SOURCES, SelfPlayConfig
 from service.envs.observations import layouts
 from service.generator.opponents import Opponents
+from service.generator.sources import check_source
 from service.methods.method import Health, Iteration, Method, State
 from service.methods.workers import GeneratorWorker, RolloutWorker, RoundSummary
 from service.policies.parameters import Parameters
@@ -220,6 +222,19 @@ def _round_metrics(rounds: Sequence[RoundSummary]) -> Metrics:
         "world/num_broken": float(sum(each.num_diverged for each in rounds)),
         "time/play_s": float(np.mean([each.play_s for each in rounds])),
     }
+
+
+def begin(config: SelfPlayConfig, registry: Path | str, start_from: Trained | None) -> SelfPlayConfig:
+    """The configuration, with the text of a source of goals of a user's.
+
+    Raises:
+        ConfigError: it does not run, or gives no goals.
+    """
+    if config.generator.goal_source in GOAL_SOURCES:
+        return config
+    exact = config.model_copy(update={"code": recorded(config.generator.goal_source, config.code)})
+    check_source(exact)
+    return exact
 
 
 def check_here(config: SelfPlayConfig) -> None:

@@ -19,7 +19,8 @@ from service.learner.off_policy import OffPolicyLoop, TabletopWorlds
 from service.learner.replay import Columns, ReplayBuffer
 from service.learner.sac import Batch, SACLearner
 from service.learner.sac_networks import GaussianActor
-from service.methods.skill_rewards import IntrinsicReward, make_reward
+from service.methods.intrinsic_reward import IntrinsicReward
+from service.methods.rewards import find_reward
 from service.policies.frozen_skills import draw_skills, normalised_place, skill_inputs
 from service.policies.numpy_actor import NUM_MOTION_INPUTS
 
@@ -77,7 +78,7 @@ class SkillWorlds(TabletopWorlds):
         super().load_state(worlds, random[0])
 
     def _draw(self) -> FloatArray:
-        return draw_skills(self._config.method, self.num_worlds, self._config.size, self._rng)
+        return draw_skills(self._config.prior, self.num_worlds, self._config.size, self._rng)
 
 
 class Seen(NamedTuple):
@@ -119,14 +120,16 @@ class IntrinsicBatches:
         rows = replay.read(replay.draw(size, rng))
         seen = self._see(rows)
         paid: FloatArray = self.reward.rewards(*_tensors(seen, rows["skill"], jumps=self.reward.pays_jumps)).numpy()
-        return Batch(seen.inputs, rows["action"], np.float32(self._config.reward_scale) * paid, seen.next_inputs)
+        paid = np.float32(self._config.reward_scale) * paid
+        weights = rows["skill"] if self.reward.pays_features else None
+        return Batch(seen.inputs, rows["action"], paid, seen.next_inputs, weights)
 
 
 def make_skill_loop(config: SkillDiscoveryConfig) -> tuple[OffPolicyLoop, SkillWorlds, IntrinsicBatches]:
     """Make the loop of a skill-discovery run, its worlds, which have to be closed, and what makes its batches."""
     skills = config.skills
     seeds = [int(seed) for seed in np.random.SeedSequence(config.seed).generate_state(5) >> 1]
-    reward = make_reward(skills, STATE_SIZE, seeds[0])
+    reward = find_reward(skills.method, config.code)(skills, STATE_SIZE, seeds[0])
     env = TabletopVectorEnv(
         skills.sac.num_worlds,
         config.world,
@@ -138,7 +141,8 @@ def make_skill_loop(config: SkillDiscoveryConfig) -> tuple[OffPolicyLoop, SkillW
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seeds[2])
         actor = GaussianActor(num_inputs, num_actions, skills.sac.hidden_sizes)
-    learner = SACLearner(actor, num_inputs, num_actions, skills.sac, seeds[3])
+    num_features = skills.size if reward.pays_features else None
+    learner = SACLearner(actor, num_inputs, num_actions, skills.sac, seeds[3], num_features)
     columns = {**_COLUMNS, "skill": skills.size, "action": num_actions}
     num_steps = -(-min(skills.replay_steps, config.run.total_env_steps) // skills.sac.num_worlds)
     replay = ReplayBuffer(num_steps, skills.sac.num_worlds, columns)

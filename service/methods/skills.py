@@ -5,19 +5,27 @@ An iteration is an episode of every world.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from inspect import getfile
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from service.actors.coverage import NUM_SKILLS, skill_paths, visited_share
 from service.actors.evaluation import EVALUATION_SEED
 from service.base.errors import ConfigError
 from service.base.tensors import join_parts, split_parts
 from service.base.types import Metrics
-from service.config.skills import SkillDiscoveryConfig
+from service.base.user_code import CodeError, checked, naming_errors_of, recorded
+from service.config import parse_config
+from service.config.skills import SKILLS_OF, SkillDiscoveryConfig, SkillsConfig
 from service.generator.bins import CELL_SIZE_M, GoalCells, in_air
+from service.methods.intrinsic_reward import IntrinsicReward
 from service.methods.method import Iteration, Method, State, goal_grid
-from service.methods.skill_learning import make_skill_loop
+from service.methods.rewards import find_reward
+from service.methods.skill_learning import STATE_SIZE, make_skill_loop
+from service.policies.forward import prepared, relu_layers
 from service.policies.frozen_skills import FrozenSkills, export_skills
 from service.policies.parameters import Parameters
 from service.registry.loading import Trained
@@ -26,7 +34,7 @@ from service.store.models import GoalGrid
 
 
 class SkillDiscovery(Method):
-    """LSD, METRA, DADS or DIAYN.
+    """LSD, METRA, DADS, DIAYN, CSF, or a method of a user's.
 
     Args:
         config: the run.
@@ -53,7 +61,7 @@ class SkillDiscovery(Method):
 
     def evaluate(self) -> Metrics:
         """Coverage of random skills without noise."""
-        skills = FrozenSkills(self.parameters(), self._skills.method)
+        skills = FrozenSkills(self.parameters(), self._skills)
         paths = skill_paths(
             skills,
             self._config.world,
@@ -121,14 +129,50 @@ class SkillDiscovery(Method):
 
 
 def begin(config: SkillDiscoveryConfig, registry: Path | str, start_from: Trained | None) -> SkillDiscoveryConfig:
-    """The configuration as it is.
+    """The configuration, with the text of a reward of a user's, and what those who act need to know of it.
 
     Raises:
-        ConfigError: it cannot begin from what another run has learned.
+        ConfigError: it cannot begin from what another run has learned, or the reward does not run.
     """
     if start_from is not None:
         raise ConfigError("--from is for self-play; skill discovery begins anew: leave it out")
-    return config
+    if config.skills.method in SKILLS_OF:
+        return config
+    tree, code = config.model_dump(mode="json"), recorded(config.skills.method, config.code)
+    found = check_reward(config.skills, code)
+    said = {"prior": found.prior, "zero_shot": found.zero_shot}
+    exact = parse_config({**tree, "code": code, "skills": {**tree["skills"], **said}}, where=config.skills.method)
+    assert isinstance(exact, SkillDiscoveryConfig)
+    return exact
+
+
+def check_reward(config: SkillsConfig, code: Mapping[str, str]) -> IntrinsicReward:
+    """Try a user's reward on a small batch, and what is exported of it.
+
+    Raises:
+        CodeError: it raises, gives another shape, numbers that are not finite, or a network that cannot be exported.
+    """
+    kind = find_reward(config.method, code)
+    origin = getfile(kind)
+    random = torch.Generator().manual_seed(0)
+    before, after, skill = (torch.randn(8, size, generator=random) for size in (STATE_SIZE, STATE_SIZE, config.size))
+    with naming_errors_of(origin):
+        reward, again = (kind(config, STATE_SIZE, seed) for seed in (0, 1))
+        loss, paid = reward.learn(before, after, skill), reward.rewards(before, after, skill).numpy()
+        again.load_state(reward.state())
+        resumes = again.learn(before, after, skill) == reward.learn(before, after, skill)
+        layers = prepared(np, {f"n.{name}": array for name, array in reward.exported().items()}).get("n", [])
+        rows = torch.randn(8, len(layers[0][0]) if layers else STATE_SIZE, generator=random)
+        with torch.no_grad():
+            found = reward.network(rows).numpy()
+    where = f"{origin}: {kind.__name__}"
+    checked(f"{where}.paid", paid, (8, config.size) if reward.pays_features else (8,))
+    checked(f"{where}.loss", np.array(loss), ())
+    if not resumes:
+        raise CodeError(f"{where}: goes on otherwise after load_state(state()): tensors() has to have all that changes")
+    if not layers or not np.allclose(relu_layers(np, layers, rows.numpy()), found, atol=1e-4):
+        raise CodeError(f"{where}.make_network: only torch.nn.Linear with torch.nn.ReLU between them can be exported")
+    return reward
 
 
 def make(config: SkillDiscoveryConfig, registry: Path | str, start_from: Trained | None) -> SkillDiscovery:

@@ -10,22 +10,27 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from pydantic import ValidationError
 
 from service.actors.evaluation import DeterministicPolicy, Evaluation
 from service.base.errors import ConfigError, TandemError
 from service.base.types import Metrics
+from service.base.user_code import recorded
 from service.config.distillation import DistillingConfig
+from service.config.frozen import first_error
+from service.config.run import SUCCESS_DISTANCE_M
 from service.config.self_play import MCPConfig, SelfPlayConfig
 from service.config.task import TaskConfig
 from service.config.world import WorldConfig
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.observations import POSITIONS
-from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
+from service.envs.tasks import find_task
 from service.learner.off_policy import OffPolicyLoop
 from service.learner.replay import ReplayBuffer
 from service.learner.sac import Batch, SACLearner
 from service.learner.sac_networks import GaussianActor, MCPActor
 from service.methods.method import Iteration, Method, State
+from service.methods.task_check import check_task
 from service.methods.task_evaluation import CURVE_SEED, FINAL_SEED, evaluate_on, numbers_of
 from service.methods.task_methods import TaskMethod, find_method
 from service.methods.task_worlds import TaskWorlds, columns
@@ -58,6 +63,7 @@ class TaskLearning(Method):
                 "the registry that has those with --registry"
             )
         self.config, self._acts_with = config, acts_with
+        self._task = find_task(config.task, config.code)
         torch.set_num_threads(config.run.num_threads or 1)
         self._worlds = self._make_worlds()
         self.loop = make_loop(config, self._how, acts_with, self._worlds)
@@ -69,7 +75,7 @@ class TaskLearning(Method):
         assert isinstance(self.loop.make_batch, Hindsight)
         self.loop.make_batch.set_progress(before / total)
         with self.timing("play and learn"):
-            learned = self.loop.play(min(EPISODE_STEPS * self._worlds.num_worlds, total - before))
+            learned = self.loop.play(min(self._task.episode_steps * self._worlds.num_worlds, total - before))
         metrics = self.count(self.loop.num_env_steps - before) | self._episodes()
         metrics |= {f"learner/{name}": value for name, value in learned.items()}
         metrics["learner/num_updates"] = self.loop.num_updates
@@ -109,7 +115,7 @@ class TaskLearning(Method):
     def _evaluate(self, num_episodes: int, seed: int) -> Evaluation:
         config = self.config
         return evaluate_on(
-            config.task, config.world, self.player(), num_episodes, config.seed + seed, config.run.num_threads
+            self._task, config.world, self.player(), num_episodes, config.seed + seed, config.run.num_threads
         )
 
     def _episodes(self) -> Metrics:
@@ -119,7 +125,9 @@ class TaskLearning(Method):
         if not len(finished):
             return {}
         total, last = finished.T
-        means = {"return": total.mean(), "success_last": last.mean(), "success_ever": (total > 0.0).mean()}
+        means = {"return": total.mean(), "success_last": last.mean()}
+        if self._task.reward is None:  # or else what is paid says nothing of it
+            means["success_ever"] = (total > 0.0).mean()
         return {f"rollout/{name}": float(value) for name, value in means.items()}
 
     def _make_worlds(self) -> TaskWorlds:
@@ -127,9 +135,8 @@ class TaskLearning(Method):
         env = TabletopVectorEnv(
             config.sac.num_worlds,
             config.world,
-            task=config.task,
+            task=self._task,
             success_distance_m=SUCCESS_DISTANCE_M - config.reward_margin_m,
-            max_episode_steps=EPISODE_STEPS,
             num_threads=config.run.num_threads,
         )
         return self._how.enter(env, spread_seed(config.seed, 3), self._acts_with, config.skill_steps)
@@ -160,7 +167,8 @@ class Hindsight:
             other = rng.random(size) < self.share
             achieved = replay.column("following", replay.draw_later(places, rng))[:, POSITIONS["object"]]
             rows["goal"][other] = achieved[other]
-            rows["reward"][other, 0] = self._worlds.rewards(rows["following"][other], achieved[other])
+            relabelled = {name: values[other] for name, values in rows.items()}
+            rows["reward"][other, 0] = self._worlds.rewards(relabelled, achieved[other])
         return Batch(
             learner_inputs(rows["previous"], rows["positions"], rows["goal"], self._worlds.seen),
             rows["action"],
@@ -188,7 +196,8 @@ def make_loop(config: TaskConfig, method: TaskMethod, trained: Trained, worlds: 
         )
     learner = SACLearner(actor, num_seen, size, sac, spread_seed(config.seed, 1))
     num_steps = -(-config.run.total_env_steps // (sac.num_worlds * hold))  # everything is kept
-    replay = ReplayBuffer(num_steps, sac.num_worlds, {**columns(worlds.seen), "action": size})
+    own = worlds.env.unwrapped.rules.task.is_own
+    replay = ReplayBuffer(num_steps, sac.num_worlds, {**columns(worlds.seen, view=own), "action": size})
     return OffPolicyLoop(worlds, replay, learner, Hindsight(worlds, method.her_ratio), spread_seed(config.seed, 2))
 
 
@@ -206,10 +215,10 @@ def spread_seed(seed: int, purpose: int) -> int:
 
 
 def begin(config: TaskConfig, registry: Path | str, start_from: Trained | None) -> TaskConfig:
-    """The configuration with the exact version of the primitives, and their world.
+    """The configuration with the exact version of the primitives, their world, and the text of a task of a user's.
 
     Raises:
-        TandemError: no such task or primitives; or they are not for this method.
+        TandemError: no such task or primitives; they are not for this method; or a task of a user's that does not run.
     """
     if start_from is not None:
         raise ConfigError("--from is for self-play and distillation; name primitives by --set primitives=NAME")
@@ -217,14 +226,24 @@ def begin(config: TaskConfig, registry: Path | str, start_from: Trained | None) 
     if config.world not in (WorldConfig(), found.config.world):
         raise ConfigError("world: a task is learned in the world of its primitives; leave out world")
     how.check(found)
-    return config.model_copy(
+    task = find_task(config.task, config.code)
+    check_task(task, found.config.world, relabels=how.her_ratio is not None)
+    exact = config.model_copy(
         update={
             "world": found.config.world,
             "primitives": found.reference,
             "primitives_digest": config.primitives_digest or (None if how.takes is None else found.digest),
-            "task_version": find_task(config.task).version,
+            "task_version": task.version,
+            "episode_steps": task.episode_steps,
+            "code": recorded(config.task, config.code),
         }
     )
+    if task.code:  # another length of an episode, with which settings may not go
+        try:
+            TaskConfig.model_validate(exact.model_dump(mode="json"))
+        except ValidationError as error:
+            raise ConfigError(f"{config.task}: {first_error(error)}") from None
+    return exact
 
 
 def make(config: TaskConfig, registry: Path | str, start_from: Trained | None) -> TaskLearning:

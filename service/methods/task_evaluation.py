@@ -11,7 +11,8 @@ import numpy as np
 from service.actors.evaluation import DeterministicPolicy, Evaluation, evaluate, wilson_interval
 from service.base.types import Metrics
 from service.config import WorldConfig
-from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
+from service.config.run import SUCCESS_DISTANCE_M
+from service.envs.task import Task
 
 _STUDENT = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 """97.5th percentiles of Student's t for 1 to 9 degrees of freedom; 1.96 is near enough for more."""
@@ -20,28 +21,24 @@ CURVE_SEED, FINAL_SEED = 1_000_000, 2_000_000
 
 
 def evaluate_on(
-    task: str, world: WorldConfig, player: DeterministicPolicy, num_episodes: int, seed: int, num_threads: int = 0
+    task: Task, world: WorldConfig, player: DeterministicPolicy, num_episodes: int, seed: int, num_threads: int = 0
 ) -> Evaluation:
     """Evaluate a player, who has not played yet, on a task.
 
     Args:
-        task: its name.
+        task: is played.
         world: in which the player was trained, of which the task replaces its part.
         player: acts.
         num_episodes: random goals, each from a fresh reset.
         seed: of the episodes.
         num_threads: of physics; 0: as many as there are cores.
-
-    Raises:
-        TandemError: no such task.
     """
-    found = find_task(task)
     return evaluate(
         player,
-        found.world_from(world),
-        found.goals,
+        task.world_from(world),
+        task,
         num_episodes=num_episodes,
-        num_steps=EPISODE_STEPS,
+        num_steps=task.episode_steps,
         success_distance_m=SUCCESS_DISTANCE_M,
         seed=seed,
         num_threads=num_threads,

@@ -14,7 +14,6 @@ from typing import Any
 import gymnasium
 
 from service.base.errors import TandemError, did_you_mean
-from service.config.skills import SkillMethod
 from service.envs.observations import layouts
 from service.methods.compose import ComposePrimitivesVector, check_primitives, check_robot
 from service.methods.task_worlds import SkillTaskWorlds, TaskWorlds
@@ -42,7 +41,7 @@ class TaskMethod:
     linear in between; None: no HER."""
     learns: bool = True
     """Or else it plays what it takes as it is."""
-    skills: SkillMethod | None = None
+    skills: str | None = None
     """The skill-discovery method whose skills it takes."""
     residual: float = 0.0
     """Size of the greatest action that its learner adds to the composition."""
@@ -61,7 +60,7 @@ class TaskMethod:
             trained: what it takes.
             hold_steps: env steps that a skill is held.
         """
-        if self.skills is not None:
+        if self.takes == "skills":
             return SkillTaskWorlds(env, seed, trained.skills, hold_steps)
         if self.composes:
             env = ComposePrimitivesVector(env, trained, residual=self.residual)
@@ -97,12 +96,12 @@ _HER_SHARE = 0.8
 """1 - 1 / (k + 1) for the usual k = 4 (Andrychowicz et al. 2017)."""
 
 
-def _skill_method(name: SkillMethod) -> TaskMethod:
+def _skill_method(name: str) -> TaskMethod:
     title = f"{name.upper()} skills"
     return TaskMethod(title, "SAC sets the skill vector", "skills", skills=name)
 
 
-def _zero_shot_method(name: SkillMethod) -> TaskMethod:
+def _zero_shot_method(name: str) -> TaskMethod:
     return TaskMethod(f"{name.upper()}, zero-shot", "its skill towards the goal", "skills", learns=False, skills=name)
 
 
@@ -134,8 +133,11 @@ METHODS: Mapping[str, TaskMethod] = {
     "dads": _skill_method("dads"),
     "diayn": _skill_method("diayn"),
     "metra": _skill_method("metra"),
+    "csf": _skill_method("csf"),
+    "any-skills": TaskMethod("skills", "SAC sets the skill vector, whoever's they are", "skills"),
     "lsd-zero-shot": _zero_shot_method("lsd"),
     "metra-zero-shot": _zero_shot_method("metra"),
+    "csf-zero-shot": _zero_shot_method("csf"),
     "idle": TaskMethod("idle", "does nothing", learns=False),
 }
 """The methods by the names that commands take, in the order of the table's rows."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from service.base.types import Array, Arrays, BoolArray, FloatArray
 from service.envs.observations import PAPER, POSITIONS, Layouts
+from service.envs.task import num_in_rows
 from service.learner.off_policy import Step, TabletopWorlds
 from service.learner.replay import Columns
 from service.policies.frozen_skills import FrozenSkills
@@ -20,12 +21,14 @@ from service.registry.learned import learner_inputs
 _POSITIONS = ("previous", "positions", "before", "following")
 
 
-def columns(seen: Layouts) -> dict[str, int]:
+def columns(seen: Layouts, *, view: bool = False) -> dict[str, int]:
     """Sizes of a transition's columns, by name, but for ``action``.
 
-    They are positions one env step ago, now, one env step before it ended and when it ended, goal and reward.
+    They are positions one env step ago, now, one env step before it ended and when it ended, goal and reward; with
+    ``view`` also what the functions of a task saw when it ended.
     """
-    return {**dict.fromkeys(_POSITIONS, seen.positions.size), "goal": 3, "reward": 1}
+    kept = {**dict.fromkeys(_POSITIONS, seen.positions.size), "goal": 3, "reward": 1}
+    return {**kept, "view": num_in_rows(1)} if view else kept
 
 
 class TaskWorlds(TabletopWorlds):
@@ -54,11 +57,16 @@ class TaskWorlds(TabletopWorlds):
         self.finished += zip(self._returns[step.ended].tolist(), step.success[step.ended].tolist(), strict=True)
         self._returns[step.ended] = 0.0
         columns = {name: getattr(step, name) for name in (*_POSITIONS, "goal")}
+        if step.view is not None:
+            columns["view"] = step.view
         return {**columns, "reward": step.reward[:, None], "action": actions}, step.ended
 
-    def rewards(self, following: FloatArray, goal: FloatArray) -> FloatArray:
-        """(B,) rewards for (B, P) positions come to, had the goals (B, 3) been others."""
-        paid: FloatArray = self.env.compute_reward(following[:, POSITIONS["object"]], goal, {})
+    def rewards(self, rows: Columns, goal: FloatArray) -> FloatArray:
+        """(B,) rewards of transitions, (B, size) a column, had their goals (B, 3) been others."""
+        if "view" in rows:
+            paid: FloatArray = self.env.unwrapped.rewards_of(rows["view"], goal)
+            return paid
+        paid = self.env.compute_reward(rows["following"][:, POSITIONS["object"]], goal, {})
         return paid
 
     def state(self) -> tuple[Arrays, Any]:
@@ -112,5 +120,6 @@ class SkillTaskWorlds(TaskWorlds):
                 reward=np.where(goes_on, total.reward + step.reward, total.reward),
                 ended=total.ended | step.ended,
                 success=np.where(goes_on, step.success, total.success),
+                view=None if step.view is None or total.view is None else np.where(last, step.view, total.view),
             )
         return total

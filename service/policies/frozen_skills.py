@@ -8,7 +8,7 @@ import numpy as np
 
 from service.base.errors import TandemError
 from service.base.types import FloatArray
-from service.config.skills import SkillMethod
+from service.config.skills import Prior, SkillsConfig
 from service.envs.observations import BOB, POSITIONS
 from service.policies.forward import prepared, relu_layers
 from service.policies.numpy_actor import NUM_MOTION_INPUTS, NumpyActor, motion_inputs, relu_shapes
@@ -32,15 +32,12 @@ def skill_inputs(previous: FloatArray, positions: FloatArray, skill: FloatArray)
     return inputs
 
 
-def draw_skills(method: SkillMethod, num: int, size: int, rng: np.random.Generator) -> FloatArray:
-    """(num, Z) skills of a method's prior.
-
-    LSD and DIAYN: N(0, I). METRA: uniform on the unit sphere. DADS: uniform in [-1, 1].
-    """
-    if method == "dads":
+def draw_skills(prior: Prior, num: int, size: int, rng: np.random.Generator) -> FloatArray:
+    """(num, Z) skills of a prior: N(0, I), uniform on the unit sphere, or uniform in [-1, 1]."""
+    if prior == "uniform":
         return rng.uniform(-1.0, 1.0, (num, size)).astype(np.float32)
     drawn: FloatArray = rng.standard_normal((num, size), dtype=np.float32)
-    if method == "metra":
+    if prior == "sphere":
         drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
     return drawn
 
@@ -56,13 +53,13 @@ class FrozenSkills:
 
     Args:
         parameters: of ``export_skills``.
-        method: that learned them.
+        config: of the method that learned them.
 
     Raises:
         PolicyError: a parameter is missing, left over, of a wrong shape or not finite.
     """
 
-    def __init__(self, parameters: Parameters, method: SkillMethod) -> None:
+    def __init__(self, parameters: Parameters, config: SkillsConfig) -> None:
         parts: dict[str, dict[str, FloatArray]] = {"actor": {}, "network": {}}
         for name, array in parameters.items():
             part, _, rest = name.partition(".")
@@ -71,7 +68,8 @@ class FrozenSkills:
                     f"policy parameter {name!r}: not of skills; load what a skill-discovery run published"
                 )
             parts[part][rest] = array
-        self.actor, self.method = NumpyActor(parts["actor"]), method
+        self.actor, self.method = NumpyActor(parts["actor"]), config.method
+        self.prior, self.zero_shot = config.prior, config.zero_shot
         self.size = self.actor.num_inputs - NUM_MOTION_INPUTS
         """Z."""
         network = {f"network.{name}": array for name, array in parts["network"].items()}
@@ -79,17 +77,17 @@ class FrozenSkills:
 
     def draw(self, num: int, rng: np.random.Generator) -> FloatArray:
         """(num, Z) skills of the prior."""
-        return draw_skills(self.method, num, self.size, rng)
+        return draw_skills(self.prior, num, self.size, rng)
 
     def from_action(self, actions: FloatArray) -> FloatArray:
         """(N, Z) skills that (N, Z) actions in [-1, 1] of an orchestrator mean.
 
-        LSD and DIAYN: up to 1.5 standard deviations of the prior, as in CSF's code. METRA: their direction. DADS: they
+        Of N(0, I) up to 1.5 standard deviations, as in CSF's code; on the unit sphere their direction; else they
         themselves.
         """
-        if self.method == "dads":
+        if self.prior == "uniform":
             return actions
-        if self.method == "metra":
+        if self.prior == "sphere":
             normalised: FloatArray = actions / np.maximum(
                 np.linalg.norm(actions, axis=1, keepdims=True), np.float32(1e-6)
             )
@@ -116,21 +114,21 @@ class FrozenSkills:
     def towards(self, positions: FloatArray, goal: FloatArray) -> FloatArray:
         """(N, Z) skills that lead to (N, 3) goals, metres, without learning: zero-shot.
 
-        LSD, METRA: the direction from phi(s) to phi(g), as long as skills are on average. DIAYN: what tells g.
+        LSD, METRA, CSF: the direction from phi(s) to phi(g), as long as skills are on average. DIAYN: what tells g.
 
         Raises:
-            TandemError: DADS says nothing of the kind.
+            TandemError: the method, such as DADS, says nothing of the kind.
         """
         there = normalised_place(goal)
-        if self.method == "diayn":
+        if self.zero_shot == "place":
             found: FloatArray = relu_layers(np, self.network, there)
             return found
-        if self.method == "dads":
-            raise TandemError("skills of DADS lead to no given goal; learn an orchestrator")
+        if self.zero_shot == "none":
+            raise TandemError(f"skills of {self.method} lead to no goal; learn an orchestrator")
         here = normalised_place(positions[:, _OBJECT])
         step = relu_layers(np, self.network, there) - relu_layers(np, self.network, here)
         mean_length = math.sqrt(2.0) * math.gamma((self.size + 1) / 2) / math.gamma(self.size / 2)  # of N(0, I)
-        length = np.float32(1.0 if self.method == "metra" else mean_length)
+        length = np.float32(1.0 if self.prior == "sphere" else mean_length)
         skills: FloatArray = length * step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), np.float32(1e-6))
         return skills
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from service.config.skills import SKILLS_OF
 from service.registry.loading import ORCHESTRATOR, SKILLS
 from service.registry.manifest import Manifest
 
@@ -42,6 +43,11 @@ PAPERS = {
         "2310.08887",
         "Seohong Park, Oleh Rybkin, Sergey Levine: *METRA: Scalable Unsupervised RL with Metric-Aware Abstraction*, "
         "2023",
+    ),
+    "csf": (
+        "2412.08021",
+        "Chongyi Zheng, Jens Tuyls, Joanne Peng, Benjamin Eysenbach: *Can a MISL Fly? Analysis and Ingredients for "
+        "Mutual Information Skill Learning*, 2024",
     ),
 }
 """Numbers at arXiv and citations, as in ``docs/bibliography.md``, which does not come with the package."""
@@ -112,7 +118,7 @@ def model_card(manifest: Manifest, *, licence: str = LICENCE) -> str:
         "## How to load it",
         "No index of packages has Tandem yet. In a clone of its repository:",
         "```sh\npip install .\n```",
-        f"```python\nimport service\n\n{code}\n```",
+        f"```python\nimport tandem_skills as tandem\n\n{code}\n```",
         f"`registry` is a directory, or the `http://HOST:PORT` of a `tandem serve`. {after}",
         "## Papers",
         "\n".join(f"- {words}. [arXiv {number}](https://arxiv.org/abs/{number})."
@@ -129,11 +135,12 @@ def _kind(manifest: Manifest) -> tuple[str, str, str, list[str]]:
     after = "In place of the name, the folder that `tandem registry export` has written will do."
     if spaces.get("kind") == ORCHESTRATOR:
         method, frozen = str(spaces.get("method", "")), spaces.get("primitives", "?")
-        takes, how = (SKILLS, [method]) if method in PAPERS else ("primitives", ["self-play", "mcp"])
+        skilled = method in (*SKILLS_OF, "any-skills")
+        takes, how = (SKILLS, [method] * (method in PAPERS)) if skilled else ("primitives", ["self-play", "mcp"])
         return (
             f"An orchestrator of Tandem: a policy for the task *{spaces.get('task', '?')}* that acts with the frozen "
             f"{takes} `{frozen}` (digest `{str(spaces.get('primitives_digest', '?'))[:12]}`), and with no others.",
-            f'policy = service.load("{name}", registry="registry")\n'
+            f'policy = tandem.load("{name}", registry="registry")\n'
             "policy.begin()  # before new episodes: it remembers the step before\n"
             "action = policy.act_deterministic(observation)  # (N, O) positions and goal -> (N, 4)",
             f"The registry, or the one that comes with the package, has to have `{frozen}`, too.",
@@ -141,10 +148,11 @@ def _kind(manifest: Manifest) -> tuple[str, str, str, list[str]]:
         )
     if spaces.get("kind") == SKILLS:
         method = str(_at(config, "skills", "method") or "?")
+        found_by = method.upper() if method in SKILLS_OF else method
         return (
-            f"Frozen skills of Tandem, found by {method.upper()}: a policy that acts by a vector of "
+            f"Frozen skills of Tandem, found by {found_by}: a policy that acts by a vector of "
             f"{spaces.get('skill')} numbers. No task and no reward was written for them.",
-            f'skills = service.load("{name}", registry="registry").skills',
+            f'skills = tandem.load("{name}", registry="registry").skills',
             after,
             [*[method] * (method in PAPERS), "sac", "tandem"],
         )
@@ -155,7 +163,7 @@ def _kind(manifest: Manifest) -> tuple[str, str, str, list[str]]:
         f"{_at(config, 'policy', 'bob', 'num_primitives') or 'The'} frozen primitives of Tandem, and the gate that "
         f"composes them: a policy that brings an object to a goal. They were learned {learned}. No task and no reward "
         "was written for them. New tasks are learned by composing them.",
-        f'bob = service.load("{name}", registry="registry")\n'
+        f'bob = tandem.load("{name}", registry="registry")\n'
         "action = bob.policy.act_deterministic(observation)  "
         f"# (N, {spaces.get('observation', 'O')}) positions and goal -> (N, 4)",
         after,

@@ -8,21 +8,25 @@ from __future__ import annotations
 
 import hashlib
 import operator
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 
 from service.base.errors import ConfigError, TandemError
 from service.base.tensors import digest_of, split_parts
 from service.base.types import Array, FloatArray
+from service.base.user_code import parse_reference
 from service.config import Config, WorldConfig
+from service.config.run import SUCCESS_DISTANCE_M
 from service.config.skills import SkillDiscoveryConfig
 from service.config.task import TaskConfig
 from service.envs.observations import layouts
-from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
+from service.envs.task import Task
+from service.envs.tasks import find_task
 from service.policies.frozen_skills import FrozenSkills, ZeroShotPolicy
 from service.policies.numpy_actor import numpy_actor
 from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy, NumpyPolicy, numpy_bob
@@ -30,6 +34,7 @@ from service.policies.parameters import Parameters, PolicyError
 from service.registry.bundled import BUNDLED, find_version, is_bundled, is_exported
 from service.registry.learned import LearnedPolicy
 from service.registry.manifest import Manifest, acting_config
+from service.registry.names import NAME_PATTERN
 from service.store.checkpoints import Checkpoint, CheckpointStore, read_checkpoint
 from service.store.run_directory import Published, RunDirectory
 
@@ -74,8 +79,8 @@ class Trained:
     version, and of distillation, only the first."""
     alice: NumpyGaussianPolicy | None = None
     """Of a run of self-play."""
-    task: str | None = None
-    """Name of the task that it plays, such as ``push``."""
+    task: Task | None = None
+    """The task that it plays."""
     method: str | None = None
     """Name of the method that learned a policy of a task, such as ``ours-her``."""
     trained: Trained | None = None
@@ -93,7 +98,7 @@ class Trained:
     @property
     def title(self) -> str:
         """Its label, and the task that it plays."""
-        return self.label if self.task is None else f"{self.label} on {find_task(self.task).title}"
+        return self.label if self.task is None else f"{self.label} on {self.task.title}"
 
     @property
     def reference(self) -> str:
@@ -110,7 +115,7 @@ class Trained:
     @property
     def world(self) -> WorldConfig:
         """The world of its task, or of its training."""
-        return self.config.world if self.task is None else find_task(self.task).world_from(self.config.world)
+        return self.config.world if self.task is None else self.task.world_from(self.config.world)
 
     @property
     def nominal(self) -> Trained:
@@ -118,16 +123,32 @@ class Trained:
         return replace(self, config=self.config.model_copy(update={"world": self.config.world.nominal}))
 
     @property
-    def goals(self) -> GoalKind:
-        """Random goals that it is tried on."""
-        if self.task is not None:
-            return find_task(self.task).goals
-        return "mixed" if self.config.world.fixture == "none" else "table"
+    def tried_on(self) -> Task:
+        """Its task, or the random goals that it is tried on."""
+        return self.task or Task("Goals", goals="mixed" if self.config.world.fixture == "none" else "table")
+
+    @property
+    def goal_kind(self) -> GoalKind:
+        """Random goals that it is tried on, where success is to be within a distance of them.
+
+        Raises:
+            TandemError: its task says otherwise.
+        """
+        task = self.tried_on
+        if task.closed or task.is_own or not isinstance(task.goals, str):
+            raise TandemError(
+                f"{self.title}: that task has goals, success or reward of its own, which are not known here"
+            )
+        return task.goals
+
+    def on_goals(self, kind: GoalKind | None) -> Task:
+        """What it is tried on, with random goals of that kind; None: as it is."""
+        return self.tried_on if kind is None else replace(self.tried_on, goals=kind)
 
     @property
     def num_steps(self) -> int:
         """Steps of an episode in which it is tried."""
-        return self.config.run.evaluation_steps if self.task is None else EPISODE_STEPS
+        return self.config.run.evaluation_steps if self.task is None else self.task.episode_steps
 
     @property
     def success_distance_m(self) -> float:
@@ -189,8 +210,12 @@ class Trained:
         return self.policy
 
     def on(self, task: str | None) -> Trained:
-        """The same on a task, without Alice; None: as it is."""
-        return self if task is None else replace(self, task=task, alice=None)
+        """The same on a task, by its name or file, without Alice; None: as it is.
+
+        Raises:
+            TandemError: no such task.
+        """
+        return self if task is None else replace(self, task=find_task(task), alice=None)
 
     def expect(self, *kinds: Kind, by: str) -> Trained:
         """Itself, if it is of one of these kinds.
@@ -215,7 +240,7 @@ class Trained:
         Raises:
             TandemError: it cannot; see ``expect``.
         """
-        if self.kind == SKILLS and self.skills.method == "dads":
+        if self.kind == SKILLS and self.skills.zero_shot == "none":
             raise TandemError(f"{self.label} is {self._what}, which no goal leads; {by} needs a policy with goals")
         return self
 
@@ -223,15 +248,23 @@ class Trained:
     def _what(self) -> str:
         if self.kind == SKILLS:
             return f"a set of skills of {self.skills.method}"
-        return "a set of primitives" if self.kind == PRIMITIVES else f"a policy of the task {self.task}"
+        if self.kind == PRIMITIVES or self.task is None:
+            return "a set of primitives"
+        return f"a policy of the task {self.task.name}"
 
 
-def load(reference: str, registry: Path | str = "registry", primitives: str | None = None) -> Trained:
+def load(
+    reference: str,
+    registry: Path | str = "registry",
+    primitives: str | None = None,
+    *,
+    run_task_code: bool = False,
+) -> Trained:
     """Load what was trained; see ``service.load``."""
     path = Path(reference)
     is_place = path.is_dir() or "/" in reference or (path.suffix == ".safetensors" and path.is_file())
     if is_exported(path) or not is_place:
-        found = _load_version(reference, registry, primitives)
+        found = _load_version(reference, registry, primitives, run_task_code=run_task_code)
     elif (path / _DESCRIPTION).exists():
         raise TandemError(
             f"{reference} is a folder of tandem export, made for use without tandem: name what it was made of, as its "
@@ -265,7 +298,31 @@ def read_stages(directory: RunDirectory) -> dict[int, Parameters]:
     return dict(sorted(stages.items()))  # a killed run may have a snapshot that is newer than its checkpoint
 
 
-def _load_version(reference: str, registry: Path | str, primitives: str | None) -> Trained:
+def _task_of(spaces: Mapping[str, Any], manifest: Manifest, label: str, *, run_code: bool) -> Task:
+    """The task of a published policy: a user's own without its functions, unless its code may run.
+
+    Raises:
+        TandemError: no such task, or a manifest that lacks what its own one needs.
+    """
+    name, code = str(spaces["task"]), cast("Any", manifest.config.get("code"))
+    reference = parse_reference(name)
+    if reference is None:
+        return find_task(name)
+    if run_code:
+        if not isinstance(code, dict) or not isinstance(code.get(reference.origin), str):
+            raise TandemError(f"{label}: its manifest lacks the text of {reference.origin}; publish it again")
+        return find_task(name, code)
+    why = (
+        f"{label}: what counts is said by code of its publisher, {name}; read it in the manifest, then give "
+        "--run-task-code"
+    )
+    try:
+        return Task(**{**dict(spaces["own_task"]), "closed": why})
+    except (KeyError, TypeError, ValueError) as error:
+        raise TandemError(f"{label}: its manifest does not describe its task, {name}: {error}") from None
+
+
+def _load_version(reference: str, registry: Path | str, primitives: str | None, *, run_task_code: bool) -> Trained:
     place, version = find_version(reference, registry)
     manifest, parameters = place.load(str(version))
     # two registries may both have a version 1: which one was meant must be seen
@@ -276,7 +333,12 @@ def _load_version(reference: str, registry: Path | str, primitives: str | None) 
         spaces: dict[str, Any] = dict(manifest.spaces)
         try:
             name, digest, hold_steps = spaces["primitives"], spaces["primitives_digest"], spaces["hold_steps"]
-            about: dict[str, Any] = {"task": spaces["task"], "method": spaces["method"]}
+            if re.fullmatch(rf"{NAME_PATTERN.strip('^$')}@[0-9]+", str(name)) is None:  # a directory could bring code
+                raise TandemError(f"{label}: it acts with {name!r}, which is no NAME@VERSION; publish it again")
+            about: dict[str, Any] = {
+                "task": _task_of(spaces, manifest, label, run_code=run_task_code),
+                "method": spaces["method"],
+            }
         except KeyError as error:
             raise TandemError(f"{label}: its manifest lacks {error}; publish it again") from None
         trained = _find_frozen(label, name, digest, (registry, primitives))
@@ -316,7 +378,7 @@ def network_problems(manifest: Manifest, arrays: Parameters) -> list[str]:
 
 
 def _skills(config: SkillDiscoveryConfig, parameters: Parameters) -> ZeroShotPolicy:
-    return ZeroShotPolicy(FrozenSkills(parameters, config.skills.method))
+    return ZeroShotPolicy(FrozenSkills(parameters, config.skills))
 
 
 def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tuple[Path | str, str | None]) -> Trained:
@@ -338,7 +400,8 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
         if config.primitives_digest is not None:
             trained = _find_frozen(label, config.primitives, config.primitives_digest, place)
         policy = _learned(parameters, trained, config, config.hold_steps)
-        about: dict[str, Any] = {"task": config.task, "method": config.method, "trained": trained}
+        task = find_task(config.task, config.code)
+        about: dict[str, Any] = {"task": task, "method": config.method, "trained": trained}
         return Trained(label, ORCHESTRATOR, config, policy, parameters, path=path, **about)
     networks: dict[str, Parameters] = {"bob/policy": parameters}
     alice = None
@@ -359,13 +422,18 @@ def _learned(parameters: Parameters, trained: Trained | None, config: Config, ho
 
 
 def _find_frozen(label: str, name: str, digest: str, place: tuple[Path | str, str | None]) -> Trained:
-    """The primitives or skills of that digest: where they are said to be, in the registry, or what is bundled."""
+    """The primitives or skills of that digest: where they are said to be, in the registry, or what is bundled.
+
+    A version is looked up as such: a directory of that name might have code of its own.
+    """
     registry, named = place
     places: list[tuple[str, Path | str]] = [(named, registry)] if named else [(name, registry), (name, BUNDLED)]
     problems = []
     for reference, root in places:
         try:
-            trained = load(reference, root).expect(PRIMITIVES, SKILLS, by=label)
+            is_place = reference == named or "/" in reference
+            found = load(reference, root) if is_place else _load_version(reference, root, None, run_task_code=False)
+            trained = found.expect(PRIMITIVES, SKILLS, by=label)
         except TandemError as error:
             problems.append(str(error))
             continue

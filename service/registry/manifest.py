@@ -32,6 +32,8 @@ ACTING = (
     "game.bob_steps",
     "game.bob_hold_steps",
     "skills.method",
+    "skills.prior",
+    "skills.zero_shot",
     "skills.size",
     "skills.episode_steps",
     "skills.hidden_sizes",

@@ -15,6 +15,7 @@ from service.config import Config
 from service.config.skills import SkillDiscoveryConfig
 from service.config.task import TaskConfig
 from service.envs.observations import POSITIONS, SPACES, layouts
+from service.envs.tasks import find_task
 from service.policies.frozen_skills import FrozenSkills
 from service.policies.numpy_policy import numpy_bob
 from service.policies.parameters import Parameters
@@ -52,7 +53,7 @@ def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
 def measure_skills(config: SkillDiscoveryConfig, parameters: Parameters) -> dict[str, float]:
     """Share of the workspace's table that random skills move the object over, without noise."""
     paths = skill_paths(
-        FrozenSkills(parameters, config.skills.method),
+        FrozenSkills(parameters, config.skills),
         config.world,
         num_skills=NUM_SKILLS,
         num_steps=config.skills.episode_steps,
@@ -151,6 +152,8 @@ def _described(config: Config) -> dict[str, Any]:
             "primitives": config.primitives,
             "primitives_digest": config.primitives_digest,
         }
+        if (task := find_task(config.task, config.code)).code:
+            spaces["own_task"] = task.data()
         return {
             "spaces": spaces,
             "normalisation": {"made_by": num_inputs.__module__, "num_inputs": num_inputs(seen)[1]},

@@ -110,7 +110,9 @@ def play(
     """
     rng = np.random.default_rng(seed)
     places = draw_objects(rng, num_episodes, policy.world)
-    goals = draw_goals(policy.goals, rng, policy.world, policy.success_distance_m, places)
+    goals = np.zeros((num_episodes, 3))
+    if goal_m is None:
+        goals = draw_goals(policy.goal_kind, rng, policy.world, policy.success_distance_m, places)
     for episode in range(num_episodes):
         if backend.simulator is not None:
             backend.begin(places.object[episode])
@@ -132,7 +134,7 @@ def _goal_from(backend: Backend, rng: np.random.Generator, policy: Trained) -> S
     if policy.world.fixture == "box":
         raise RobotError(f"{policy.label} brings the object into a box, and nothing tells a bridge where it is: --goal")
     places = Places(object_m[None], np.empty((1, 0)), np.empty((1, 0, 3)))
-    goal: StateArray = draw_goals(policy.goals, rng, policy.world, policy.success_distance_m, places)[0]
+    goal: StateArray = draw_goals(policy.goal_kind, rng, policy.world, policy.success_distance_m, places)[0]
     return goal
 
 

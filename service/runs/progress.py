@@ -16,6 +16,7 @@ _PATTERNS = {
     "skills/moved_fraction": "{:.0%}",
     "skills/lifted_fraction": "{:.0%}",
     "skills/distance_m": "{:.3f} m",
+    "evaluation/mixed_success_last": "{:.0%}",
     "evaluation/table_success_last": "{:.0%}",
     "evaluation/air_success_last": "{:.0%}",
     "evaluation/coverage": "{:.0%}",

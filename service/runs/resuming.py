@@ -47,7 +47,7 @@ def resumed_config(directory: RunDirectory | Path, overrides: list[str], file: P
             )
     changing = [override for override in overrides if override not in fixed]
     if file is not None:
-        given = load_config(file, fixed)
+        given = load_config(file, fixed, saved.code)
         for key, (old, new) in _differences(saved.model_dump(mode="json"), as_saved(given)).items():
             if not f"{key}=".startswith(saved.resumable):
                 raise ConfigError(

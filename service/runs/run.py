@@ -11,11 +11,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from service.base.errors import CheckpointError, DivergedError
+from service.base.errors import CheckpointError, ConfigError, DivergedError
 from service.base.jsonl import Extent
 from service.base.tensors import split_parts
 from service.base.types import Arrays, Metrics
@@ -26,7 +26,9 @@ from service.runs.resuming import changed_settings
 from service.store.checkpoints import CheckpointStore
 from service.store.run_directory import Published, Resumption, RunDirectory
 
-OnIteration = Callable[[Metrics], None]
+Ending = Literal["finished", "converged"]
+OnIteration = Callable[[Metrics], Ending | None]
+"""Is told the metrics of an iteration; may say why the run is to end after it."""
 OnBeat = Callable[[], None]
 NUM_SNAPSHOTS = 10
 """Snapshots of what was learned, evenly over a run's env steps; one of it untrained comes before them."""
@@ -76,6 +78,7 @@ class Run:
         self._iteration_s = 0.0
         self._last_beat = time.monotonic()
         self._stop_requested = False
+        self._ending: Ending | None = None
         self._on_iteration: OnIteration = lambda metrics: None
         self._on_beat: OnBeat = lambda: None
         saved = self._load() if resume else None
@@ -120,7 +123,7 @@ class Run:
         """Learn and record until the budget is spent, the method has converged, or a stop is requested.
 
         Args:
-            on_iteration: called with the metrics of every iteration.
+            on_iteration: called with the metrics of every iteration; what it returns, if anything, ends the run.
             on_beat: called about every second where iterations take longer.
 
         Returns:
@@ -144,6 +147,8 @@ class Run:
     def _stop_reason(self) -> str | None:
         if self._stop_requested:
             return "interrupted"
+        if self._ending is not None:
+            return self._ending
         if self.num_env_steps >= self.config.run.total_env_steps:
             return "finished"
         return "converged" if self.method.converged else None
@@ -181,7 +186,9 @@ class Run:
         self.directory.record(metrics)
         if ended.goals is not None:
             self.directory.record_goals(self.iteration, self.num_env_steps, ended.goals)
-        self._on_iteration(metrics)
+        self._ending = self._on_iteration(metrics)
+        if self._ending not in (None, *get_args(Ending)):
+            raise ConfigError(f"on_iteration gave {self._ending!r}: return None, or {' or '.join(get_args(Ending))}")
 
     def _beat(self) -> None:
         if time.monotonic() - self._last_beat >= BEAT_S:

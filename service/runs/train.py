@@ -20,9 +20,11 @@ from pydantic import JsonValue
 from service.base.errors import StoreError, TandemError
 from service.base.progress import answer, doing
 from service.base.types import Metrics
+from service.base.user_code import changed_since
 from service.config import Config
 from service.config.skills import SkillDiscoveryConfig
 from service.config.task import TaskConfig
+from service.envs.tasks import find_task
 from service.media.artifacts import make_artifacts
 from service.methods.method import Method, StateLostError, WorkersError
 from service.methods.task_evaluation import FINAL_SEED, evaluate_on, numbers_of
@@ -31,7 +33,7 @@ from service.registry.names import Version, check_name
 from service.registry.publishing import check_publishable, measure_bob, measure_skills, publish_run
 from service.registry.registry import Registry
 from service.runs.report import Report
-from service.runs.run import OnIteration, Run
+from service.runs.run import Ending, OnIteration, Run
 from service.runs.signals import InterruptError, StopSignals
 from service.store.address import address_from_environment
 from service.store.checkpoints import CheckpointStore
@@ -122,7 +124,7 @@ def train(
         registry: directory where it publishes; what the method takes is looked up there, too.
         resume: continue the run that the directory holds.
         publish: or else leave that to a later resume, or to ``publish_run``.
-        on_iteration: called with the metrics of every iteration.
+        on_iteration: called with the metrics of every iteration; what it returns, if anything, ends the run.
         runtime: where its workers are; None: in this process.
         start: what a new run begins from (``service.load``); a resumed one has begun already.
 
@@ -136,6 +138,10 @@ def train(
     with StopSignals() as signals, ExitStack() as stack:
         stack.callback(directory.close)
         last = prepare(config, directory, registry, resume=resume, publish=publish, runtime=runtime)
+        for origin in changed_since(config.code):
+            _logger.warning(
+                "%s has another text by now than the configuration of this run, which runs with its own", origin
+            )
         run_id = run_id_of(directory.path)
         previous = read_status(directory.path) if resume else None
         writer = reporting_to(directory, run_id, address_from_environment())
@@ -218,9 +224,10 @@ def _end_now(report: Report, directory: RunDirectory, what: str) -> None:
 def _run(
     run: Run, registry: Path | str, publish: bool, signals: StopSignals, report: Report, on_iteration: OnIteration
 ) -> Finished:
-    def tell(metrics: dict[str, float]) -> None:
-        on_iteration(metrics)
+    def tell(metrics: dict[str, float]) -> Ending | None:
+        ending = on_iteration(metrics)
         report.iteration(run, metrics)
+        return ending
 
     def stop() -> None:
         run.request_stop()
@@ -308,7 +315,7 @@ def _measure(config: Config, learned: Trained) -> Metrics:
         return measure_skills(config, learned.parameters)
     if isinstance(config, TaskConfig):
         seed, run = config.seed + FINAL_SEED, config.run
-        player = learned.player()
-        found = evaluate_on(config.task, config.world, player, run.final_episodes, seed, run.num_threads)
+        player, task = learned.player(), find_task(config.task, config.code)
+        found = evaluate_on(task, config.world, player, run.final_episodes, seed, run.num_threads)
         return {f"evaluation/{key}": value for key, value in numbers_of(found).items()}
     return measure_bob(config, learned.parameters)

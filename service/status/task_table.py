@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 from service.base.errors import TandemError
 from service.base.parsing import parse_json
@@ -23,7 +24,7 @@ from service.store.run_directory import RESULT_FILE, RunDirectory
 
 Column = tuple[str, int]
 """A task and its version."""
-_ELSEWHERE = {"name", "primitives", "primitives_digest", "task", "task_version", "method", "seed"}
+_ELSEWHERE = {"name", "primitives", "primitives_digest", "task", "task_version", "episode_steps", "method", "seed"}
 """Keys of a configuration that say where in the table a run belongs."""
 
 
@@ -51,7 +52,7 @@ def task_table(statuses: Iterable[RunStatus], directories: Mapping[str, Path]) -
         statuses: of all runs.
         directories: of the runs that are on this machine, by their ids.
     """
-    from service.envs.tasks import HARD_TASKS, TASKS
+    from service.envs.tasks import TASKS, find_task
     from service.methods.task_methods import METHODS  # with MuJoCo and Gymnasium, which few views need
 
     runs, problems = list[_Run](), list[str]()
@@ -66,13 +67,12 @@ def task_table(statuses: Iterable[RunStatus], directories: Mapping[str, Path]) -
             problems.append(f"{path} cannot be read: {error.strerror}")
         except TandemError as error:
             problems.append(str(error))
-    tasks = {**TASKS, **HARD_TASKS}
-    columns = sorted({run.column for run in runs}, key=lambda column: (*_place(column[0], tasks), column[1]))
+    columns = sorted({run.column for run in runs}, key=lambda column: (*_place(column[0], TASKS), column[1]))
     rows = [(_first(row).trial, row) for row in _rows(runs)]
     rows.sort(key=lambda row: (*_place(row[0].method, METHODS), str(row[0].primitives)))
     return TaskTable(
         tasks=tuple(
-            TaskColumn(task=task, version=version, title=tasks[task].title if task in tasks else task)
+            TaskColumn(task=task, version=version, title=find_task(task).title if task in TASKS else task)
             for task, version in columns
         ),
         rows=tuple(
@@ -97,7 +97,12 @@ def _read(run_id: str, trial: Trial, path: Path) -> _Run:
     ended = (path / RESULT_FILE).stat().st_mtime if result is not None else 0.0
     version = settings.get("task_version")
     column = (trial.task, version if isinstance(version, int) else 0)
-    return _Run(run_id, trial, column, {key: settings[key] for key in settings if _counts(key)}, ended, result)
+    counted = {  # of a text of a user's its digest tells another
+        key: crc32(str(value).encode()) if key.startswith("code.") else value
+        for key, value in settings.items()
+        if _counts(key)
+    }
+    return _Run(run_id, trial, column, counted, ended, result)
 
 
 def _counts(key: str) -> bool:

@@ -194,7 +194,7 @@ def test_an_observer_is_given_the_worlds_at_the_start_and_after_every_step():
     common = {"num_episodes": 16, "num_steps": 12, "success_distance_m": 0.12, "seed": 0, "num_threads": 1}
     result = evaluate(
         Sweep(), FAST, "mixed", **common,
-        observe=lambda worlds, goal: steps.append(np.linalg.norm(worlds.object_position - goal, axis=1)),
+        observe=lambda worlds, goal, solved: steps.append(np.linalg.norm(worlds.object_position - goal, axis=1)),
     )  # fmt: skip
     assert result == evaluate(Sweep(), FAST, "mixed", **common)
     distance = np.stack(steps)

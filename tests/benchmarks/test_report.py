@@ -117,7 +117,7 @@ def test_an_option_that_is_gone_is_told_of_a_run_that_had_it_on():
 
 
 def test_the_digest_that_a_page_calls_the_champion_is_the_bundled_ones():
-    digest = parameters_digest(service.load_primitives("panda-cube@champion", registry="no registry here").primitives)
+    digest = parameters_digest(service.load("panda-cube@champion", registry="no registry here").primitives)
     page = (DOCS / "results" / "pretraining.md").read_text()
     ((run, words),) = re.findall(r"`panda-cube@champion`, in the package, is version \d+, the run (\S+): (.*)", page)
     assert f"parameters `{digest[:12]}`" in words

@@ -10,7 +10,7 @@ from benchmarks.trials import trial_config
 from service.cli.main import app
 from service.config import load_config
 from service.config.recipes import recipes
-from service.envs.tasks import TASKS
+from service.envs.tasks import PAPERS
 from service.methods.task_methods import METHODS
 
 
@@ -18,9 +18,9 @@ def test_every_method_is_run_on_every_task_with_three_seeds(tmp_path):
     everything = list(experiments(tmp_path))
     names = [each.name for each in everything]
     assert len(set(names)) == len(names) == len({each.file for each in everything})
-    assert {f"downstream/{task}-{method}-{seed}" for task in TASKS for method in METHODS for seed in range(3)} <= set(
-        names
-    )
+    methods = [method for method in METHODS if not method.startswith(("csf", "any-"))]  # which the paper lacks
+    cells = {f"downstream/{task}-{method}-{seed}" for task in PAPERS for method in methods for seed in range(3)}
+    assert cells <= set(names)
 
 
 def test_every_command_is_accepted_by_its_program(tmp_path):

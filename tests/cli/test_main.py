@@ -20,7 +20,6 @@ from service.config import WorldConfig, load_config
 from service.config.recipes import recipes
 from service.methods import task_evaluation  # noqa: F401  before the function that it calls is replaced
 from service.registry.bundled import BUNDLED
-from service.registry.names import Version
 from service.registry.registry import Registry
 from service.runs.signals import InterruptError
 from service.runs.study import Study
@@ -172,46 +171,61 @@ def test_pretrain_goes_to_runs_by_its_name(asked):
 
 
 def test_demo_is_a_short_pretraining_with_a_registry_of_its_own(asked):
-    tandem("demo", "--env-steps", "7")
-    tandem("demo", "--env-steps", "8")
+    tandem("demo", "--no-browser", "--env-steps", "7")
+    tandem("demo", "--no-browser", "--env-steps", "8", "--seed", "3")
     one, two = Path("runs/demo-1"), Path("runs/demo-2")
     assert [(path, registry, config.run.total_env_steps) for config, path, registry, _ in asked] == [
         (one, one / "registry", 7),
         (two, two / "registry", 8),
     ]
-    assert (asked[0][0].name, asked[0][0].run.evaluation_interval) == ("panda-cube-demo", 25)
+    configs = [each[0] for each in asked]
+    assert [(each.name, each.seed) for each in configs] == [("panda-cube-demo", 0), ("panda-cube-demo", 3)]
+    assert (configs[0].run.evaluation_interval, configs[0].run.checkpoint_interval) == (60, 10)
     (one / "config.yaml").touch()
     refused = tandem("demo", "--run-dir", one)
     assert_user_error(refused, "or continue with: tandem train --resume --run-dir runs/demo-1", "runs/demo-1/registry")
 
 
-def test_demo_ends_with_what_comes_with_tandem_and_what_to_type(monkeypatch, tmp_path):
-    from service.actors import evaluation
+@pytest.mark.parametrize(
+    ("reason", "minutes", "said"),
+    [
+        ("converged", "0.5", "Bob solves four of five random goals, twice in a row"),
+        ("finished", "0.5", "It is finished"),
+        ("finished", "0", "0 minutes are over"),
+    ],
+)
+def test_demo_ends_with_why_and_what_to_type(monkeypatch, tmp_path, reason, minutes, said):
     from service.runs.train import Finished
 
-    metrics = {"evaluation/table_success_last": 0.12, "evaluation/air_success_last": 0.03}
+    def pretrain(*args, on_iteration, **kwargs):
+        on_iteration({"env_steps": 7.0, "iteration": 1.0})
+        return Finished(reason, 1, 7, "total 1 s", {}, None, {"evaluation/mixed_success_last": 0.84})
 
-    def pretrain(*args, **kwargs):
-        return Finished("finished", 1, 7, "total 1 s", {}, Version("panda-cube-demo", 1), metrics)
-
-    real = evaluation.evaluate
-    few = {"num_episodes": 4, "num_steps": 2}
-    monkeypatch.setattr(evaluation, "evaluate", lambda *args, **kwargs: real(*args, **kwargs | few))
     monkeypatch.setattr("service.runs.train.train", pretrain)
     monkeypatch.chdir(tmp_path)
-    result = tandem("demo", "--env-steps", "7")
+    result = tandem("demo", "--no-browser", "--minutes", minutes)
     assert result.exit_code == 0, result.output
-    shown = result.stdout.partition("panda-cube-demo@1 in runs/demo-1/registry\n")[2]
-    champion = Registry(BUNDLED).resolve("panda-cube@champion")
-    assert f"\n  {champion} (bundled) " in shown
-    assert "\n  idle " in shown
-    commands = [shlex.split(line)[1:] for line in re.findall(r"^ +(tandem .*)$", shown, re.MULTILINE)]
-    assert [command[0] for command in commands] == ["evaluate", "render", "coverage", "play", "serve"]
-    assert commands[-1] == ["serve", "--runs", "runs"]
-    assert "Bob has practised for 7 steps, and now reaches 12% of random goals on the table and 3% " in shown
-    evaluated = tandem(*commands[0])
-    assert evaluated.exit_code == 0, evaluated.output
-    assert evaluated.stdout in shown  # it says the same again
+    assert f"{said}. Of 300 others he solves 84%." in result.stdout
+    commands = [shlex.split(line)[1:] for line in re.findall(r"^ +(tandem .*)$", result.stdout, re.MULTILINE)]
+    champion = "panda-cube@champion"
+    shown = [["play", "runs/demo-1"], ["serve", "--runs"], ["play", champion], ["evaluate", champion]]
+    assert [command[:2] for command in commands] == shown
+
+
+def test_demo_ends_when_bob_is_good_twice_in_a_row_or_the_time_is_over(monkeypatch):
+    from service.cli import demo
+
+    now = [100.0]
+    monkeypatch.setattr(demo.time, "monotonic", lambda: now[0])
+    until = demo.Until(2.0)
+    rates = (None, 0.8, 0.79, None, 0.8, None, 0.85)
+    found = [until({} if rate is None else {"evaluation/mixed_success_last": rate}) for rate in rates]
+    assert found == [None] * 6 + ["converged"]
+    until = demo.Until(2.0)
+    now[0] = 219.9
+    assert until({}) is None
+    now[0] = 220.0
+    assert until({"evaluation/mixed_success_last": 0.9}) == "finished"
 
 
 @pytest.mark.parametrize("seeds", [(), ("--seeds", "0,1")])

@@ -6,6 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
+from service.config.skills import SkillsConfig
 from service.registry.publishing import publish
 from service.registry.registry import Registry
 from tests.export.policies import publish_bob, write_training
@@ -51,9 +52,8 @@ def test_primitives_are_tried_on_a_task(home):
 def test_skills_are_taken_as_primitives_are(home, monkeypatch):
     shown = []
     monkeypatch.setattr("service.media.video.write_episode_video", lambda *arguments: shown.append(arguments))
-    dads = skill_sets.CONFIG.model_copy(
-        update={"name": "dads", "skills": skill_sets.CONFIG.skills.model_copy(update={"method": "dads"})}
-    )
+    settings = skill_sets.CONFIG.skills.model_dump(exclude={"prior", "zero_shot"}) | {"method": "dads"}
+    dads = skill_sets.CONFIG.model_copy(update={"name": "dads", "skills": SkillsConfig(**settings)})
     publish(Registry(home / "registry"), dads, skill_sets.parameters(), {})
     found = tandem("coverage", "dads", "--skills", 3, "--steps", 4, "--json")
     assert json.loads(found.stdout)["share_of_table_cells_visited"].keys() == {"dads@1", "random policy"}

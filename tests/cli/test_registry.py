@@ -142,8 +142,8 @@ def test_what_is_exported_is_a_version_for_every_command(tmp_path: Path, monkeyp
     assert list(played[0]) == [champion.reference, "idle"]
     assert list(played[0].values()) == list(played[2].values())
     assert_user_error(tandem("registry", "alias", "given", "best"), "cannot write given", "only read")
-    downstream = service.load_primitives("given")
-    assert parameters_digest(downstream.policy) == parameters_digest(service.load_primitives().policy)
+    downstream = service.load("given")
+    assert parameters_digest(downstream.policy) == parameters_digest(service.load().policy)
 
     parameters = tmp_path / "given" / "primitives.safetensors"
     parameters.write_bytes(parameters.read_bytes()[:-1] + b"x")

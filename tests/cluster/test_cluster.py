@@ -25,6 +25,7 @@ from service.cluster.remote_worker import RemoteWorker
 from service.cluster.self_play import RaySelfPlay, num_gpus
 from service.cluster.watch import RayletWatch
 from service.cluster.worker_variables import WORKER_VARIABLES
+from service.config import changed_config
 from service.methods.method import StateLostError, WorkersError
 from service.policies.parameters import PolicyError
 from service.runs.run import Run
@@ -34,6 +35,13 @@ from service.store.run_directory import RunDirectory
 from tests.runs.runs import FullForAWhile, assert_one_line, is_alive, newest, play, read_lines, run_on, tiny_config
 
 ENDLESS = 10**9
+GOALS = """
+from tandem_skills import GoalSource
+
+class Mine(GoalSource):
+    def goals(self, known, rng):
+        return known.random(rng)[:, None]
+"""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -121,7 +129,11 @@ def test_one_actor_plays_and_learns_what_one_process_does_and_stops_at_once(tmp_
             nice[name] = os.getpriority(os.PRIO_PROCESS, actor.pid)
         asked.append(run.iteration)
 
-    config = tiny_config(total_env_steps=ENDLESS, checkpoint_interval=10**6)
+    mine = tmp_path / "mine.py"
+    mine.write_text(GOALS)
+    plain = tiny_config(total_env_steps=ENDLESS, checkpoint_interval=10**6)
+    config = changed_config(plain, [f"generator.goal_source={mine}"]).begin(tmp_path, None)
+    mine.unlink()  # its text goes to the workers
     run, result = run_cluster(tmp_path / "ray", config, look, num_actors=1)
     assert (result.reason, [result.iteration]) == ("interrupted", asked)  # no other round was waited for
     assert CheckpointStore(tmp_path / "ray" / "checkpoints", keep=1).steps()[-1] == result.iteration

@@ -124,7 +124,7 @@ def test_overrides_beat_the_file_and_the_last_one_wins(tmp_path):
         ("world.object={shape: mesh, mesh: {pieces: [a.stl], scale: 0}}", ["world.object.mesh.scale = 0"]),
         ("game=3", ["game = 3"]),
         ("game.bob_margin_m=0.05", ["game: bob_margin_m 0.05 must be less than success_distance_m 0.05"]),
-        ("generator.goal_source=hers", ["generator.goal_source = 'hers'", "'alice', 'reached', 'uniform'"]),
+        ("generator.goal_source=hers", ["generator.goal_source = 'hers'", "alice, reached, uniform"]),
         (
             "learner.bob_help_max_success=1.5",
             ["learner.bob_help_max_success = 1.5", "less than or equal to 1"],

@@ -91,7 +91,7 @@ def test_a_run_begins_with_it_and_goes_on_with_it(arguments, monkeypatch, tmp_pa
         begun.append((study.path, resumed))
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("service.cli.train._train", train)
+    monkeypatch.setattr("service.cli.train.train_and_tell", train)
     monkeypatch.setattr(Study, "train", begin)
     monkeypatch.setattr("service.cli.study._on_ray", lambda *_: Place())
     monkeypatch.setattr("service.cluster.ray_connection.connected", lambda *_: nullcontext())

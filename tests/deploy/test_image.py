@@ -62,7 +62,16 @@ def test_stages_build_on_stages():
 def test_what_is_copied_is_there_and_not_ignored():
     copied = [shlex.split(rest)[:-1] for word, rest in instructions() if word == "COPY" and "--from" not in rest]
     names = {name for group in copied for name in group}
-    assert names == {"LICENSE", "README.md", "configs", "constraints.txt", "pyproject.toml", "service", "setup.py"}
+    assert names == {
+        "LICENSE",
+        "README.md",
+        "configs",
+        "constraints.txt",
+        "pyproject.toml",
+        "service",
+        "setup.py",
+        "tandem_skills",
+    }
     assert all((ROOT / name).exists() and not ignored(name) for name in names)
 
 

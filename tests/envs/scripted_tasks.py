@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import WorldConfig
+from service.config.run import SUCCESS_DISTANCE_M
 from service.envs import scene
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
 from service.envs.observations import ACTION
 from service.envs.sampling import draw_goals
-from service.envs.tasks import EPISODE_STEPS, SUCCESS_DISTANCE_M, find_task
+from service.envs.task import EPISODE_STEPS
+from service.envs.tasks import find_task
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

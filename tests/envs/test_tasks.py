@@ -20,12 +20,16 @@ from service.envs.batch import DISPLACEMENT_M, WorldBatch
 from service.envs.gym.tabletop import TabletopEnv
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.sampling import draw_goals
-from service.envs.tasks import EPISODE_STEPS, HARD_TASKS, TASKS, find_task
+from service.envs.task import EPISODE_STEPS, Task
+from service.envs.tasks import PAPERS, find_task
+from service.envs.tasks import TASKS as NAMES
 from tests.envs.scripted_tasks import play_task
 
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
 DOCS = Path(__file__).parents[2] / "docs"
 RECORDED, DECISION = DOCS / "results" / "scripted_tasks.json", DOCS / "decisions" / "0007-the-downstream-tasks.md"
+TASKS = {name: find_task(name) for name in PAPERS}
+HARD_TASKS = {name: find_task(name) for name in NAMES if name not in PAPERS}
 CENTER = np.array([-0.05, 0.0])
 HALF = 0.175
 """Half of the workspace's length and width, metres."""
@@ -86,9 +90,9 @@ class TestTable:
     @pytest.mark.parametrize(
         ("options", "words"),
         [
-            ({"task": "push", "goals": "air"}, "goals = 'air' beside task = 'push'"),
-            ({"config": WorldConfig(fixture="box"), "goals": "mixed"}, "goals = 'mixed' with a box"),
-            ({"config": WorldConfig(fixture="wall"), "goals": "air"}, "goals = 'air' with a wall"),
+            ({"config": WorldConfig(fixture="box"), "task": Task("Mine")}, "goals = 'mixed' with a box"),
+            ({"config": WorldConfig(fixture="wall"), "task": Task("Mine", goals="air")}, "goals = 'air' with a wall"),
+            ({"task": Task("Mine", goals="moon")}, "goals = 'moon'; choose one of table, air, mixed, volume"),
             ({"success_distance_m": float("nan")}, "success_distance_m = nan"),
         ],
     )

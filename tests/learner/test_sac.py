@@ -37,7 +37,7 @@ def test_one_step_by_hand():
     noise = torch.Generator()
     noise.set_state(learner._random.get_state())
     found = learner.update(batch)
-    inputs, actions, rewards, next_inputs = map(torch.from_numpy, batch)
+    inputs, actions, rewards, next_inputs = map(torch.from_numpy, batch[:4])
     with torch.no_grad():
         mean, log_std = before.actor(next_inputs)
         next_actions, log_prob = sample_actions(mean, log_std, torch.randn(6, 2, generator=noise))
@@ -72,9 +72,36 @@ def test_every_step_has_rows_of_its_own():
     both, one_by_one = make_learner(), make_learner()
     both.update(batch)
     for rows in (slice(0, 6), slice(6, 12)):
-        one_by_one.update(Batch(*(column[rows] for column in batch)))
+        one_by_one.update(Batch(*(column[rows] for column in batch[:4])))
     for one, other in zip(both.actor.parameters(), one_by_one.actor.parameters(), strict=True):
         assert torch.equal(one, other)
+
+
+def test_successor_features_by_hand():
+    """Of two critics the one whose features are worth less under the weights; without what entropy is worth later."""
+    learner = SACLearner(GaussianActor(3, 2, SMALL.hidden_sizes), 3, 2, SMALL, 0, 4)
+    rows = make_batch(SMALL)
+    rng = np.random.default_rng(1)
+    features, weights = (rng.standard_normal((6, 4)).astype(np.float32) for _ in range(2))
+    before = copy.deepcopy(learner)
+    noise = torch.Generator()
+    noise.set_state(learner._random.get_state())
+    found = learner.update(rows._replace(rewards=features, weights=weights))
+    inputs, actions, _, next_inputs = map(torch.from_numpy, rows[:4])
+    with torch.no_grad():
+        next_actions, _ = sample_actions(*before.actor(next_inputs), torch.randn(6, 2, generator=noise))
+        first, second = before._targets(next_inputs, next_actions).numpy()
+    lower = np.where(((first * weights).sum(1) <= (second * weights).sum(1))[:, None], first, second)
+    assert not np.array_equal(lower, np.minimum(first, second))
+    target = features + 0.9 * lower
+    values = before.critics(inputs, actions).detach().numpy()
+    assert found["critic_loss"] == pytest.approx(
+        sum(0.5 * ((value - target) ** 2).mean() for value in values), rel=1e-5
+    )
+    mean, log_std = before.actor(inputs)
+    new_actions, log_prob = sample_actions(mean, log_std, torch.randn(6, 2, generator=noise))
+    worth = (learner.critics(inputs, new_actions).detach().numpy() * weights).sum(2).min(0)
+    assert found["actor_loss"] == pytest.approx((0.1 * log_prob.detach().numpy() - worth).mean(), rel=1e-5)
 
 
 def test_it_finds_the_better_action():

@@ -9,6 +9,7 @@ from service.actors.coverage import skill_paths
 from service.actors.evaluation import evaluate
 from service.config import WorldConfig
 from service.config.self_play import GameConfig, SelfPlayConfig
+from service.config.skills import SkillsConfig
 from service.envs.batch import WorldBatch
 from service.generator.validity import Verdict
 from service.media import recording, video
@@ -156,7 +157,7 @@ def test_recorded_episodes_are_those_of_the_evaluation():
 
 
 def test_recorded_skills_are_those_of_the_coverage():
-    skills = FrozenSkills(parameters(), "lsd")
+    skills = FrozenSkills(parameters(), SkillsConfig(method="lsd"))
     common = {"num_skills": 3, "num_steps": 4, "seed": 5}
     episodes = record_skills(skills, WorldConfig(), **common)
     assert episodes.goal is None

@@ -25,4 +25,4 @@ def parameters(seed=5):
 def made(method="lsd", seed=5):
     config = CONFIG.model_copy(update={"skills": SkillsConfig(method=method, size=SIZE)})
     arrays = parameters(seed)
-    return Trained("made@1", "skills", config, ZeroShotPolicy(FrozenSkills(arrays, method)), arrays)
+    return Trained("made@1", "skills", config, ZeroShotPolicy(FrozenSkills(arrays, config.skills)), arrays)

@@ -16,6 +16,7 @@ import service
 import service.envs.gym.registration
 from service.base.errors import TandemError
 from service.config import WorldConfig
+from service.config.skills import SkillsConfig
 from service.envs.gym.tabletop import TabletopEnv
 from service.envs.gym.vector import TabletopVectorEnv
 from service.methods.compose import (
@@ -36,7 +37,7 @@ NUM_PRIMITIVES = 8
 
 @pytest.fixture(scope="module")
 def trained():
-    return service.load_primitives("panda-cube@champion", registry="no registry here")
+    return service.load("panda-cube@champion", registry="no registry here")
 
 
 @pytest.fixture
@@ -151,7 +152,7 @@ def test_a_new_episode_acts_on_its_own_start(trained):
 
 
 def test_the_digest_sees_a_single_bit(trained):
-    primitives = service.load_primitives("panda-cube@champion", registry="no registry here").primitives
+    primitives = service.load("panda-cube@champion", registry="no registry here").primitives
     assert parameters_digest(primitives) == parameters_digest(trained.primitives)
     bias = primitives.network["primitives.output_bias"]
     bias.flat[0] = np.nextafter(bias.flat[0], np.float32(9.0))
@@ -168,7 +169,7 @@ def test_digests_stay_what_they_were_when_the_first_were_recorded():
     )
     alone["squash.log_std_max"] *= 2
     assert parameters_digest(NumpyGaussianPolicy(alone))[:12] == "f7f5cc35f7b4"
-    assert parameters_digest(FrozenSkills(skills, "lsd"))[:12] == "490bcd275666"
+    assert parameters_digest(FrozenSkills(skills, SkillsConfig(method="lsd")))[:12] == "490bcd275666"
 
 
 class TestBadInput:

@@ -77,10 +77,10 @@ def test_it_is_trained_killed_and_resumed(file, tmp_path, monkeypatch):
     with pytest.raises(KilledError):
         train(config, RunDirectory(tmp_path / "cut"), tmp_path / "registry", on_iteration=kill)
     assert newest(tmp_path / "cut").step == 4
-    monkeypatch.chdir(tmp_path / "cut")  # config.yaml has the file's whole path
+    file.unlink()  # config.yaml has its text
     directory = RunDirectory(tmp_path / "cut")
     resumed = resumed_config(directory, [])
-    assert (resumed.method, resumed.step_size) == (f"{file}:Mine", 0.5)
+    assert (resumed.method, resumed.step_size, resumed.code) == ("mine.py:Mine", 0.5, {"mine.py": CODE})
     train(resumed, directory, tmp_path / "registry", resume=True, on_iteration=ignore)
     assert_same_run(tmp_path / "whole", tmp_path / "cut")
     rows = read_lines(tmp_path / "cut" / "metrics.jsonl")
@@ -99,7 +99,7 @@ def test_it_is_trained_killed_and_resumed(file, tmp_path, monkeypatch):
         (
             "mine.py:Mine",
             "game.num_goals",
-            "'game'; known there: method, name, run, seed, step_size, world",
+            "'game'; known there: code, method, name, run, seed, step_size, world",
         ),
         ("mine.py:Mine", "sac.gamma", "it is a key of method=ours"),
         ("self-play", "skill_steps", "it is a key of method=ours"),
@@ -119,12 +119,15 @@ def test_a_key_of_one_method_is_unknown_to_another(file, method, key, said):
 @pytest.mark.parametrize(
     ("method", "said"),
     [
-        ("mine.py:Climb", "Climb is no class that derives from service.config.Config"),
-        ("mine.py:Yours", "Yours is no class"),
-        ("gone.py:Mine", "no file gone.py; write FILE.py:CLASS"),
-        ("bad.py:Mine", "bad.py: ZeroDivisionError: division by zero"),
-        ("notes.txt:Mine", "notes.txt is no Python file"),
-        ("self_play", "did you mean 'self-play'?"),
+        (
+            "mine.py:Climb",
+            "mine.py:Climb: no class that derives from Config of that name",
+        ),
+        ("mine.py:Yours", "mine.py:Yours: no class that derives from Config of that name"),
+        ("gone.py:Mine", "gone.py: no such file"),
+        ("bad.py:Mine", "bad.py:1: ZeroDivisionError: division by zero"),
+        ("notes.txt:Mine", "notes.txt: no module of that name"),
+        ("self_play", "method = 'self_play': choose one of self-play"),
     ],
 )
 def test_what_is_no_method(file, tmp_path, method, said):
@@ -132,4 +135,4 @@ def test_what_is_no_method(file, tmp_path, method, said):
     (tmp_path / "notes.txt").write_text("class Mine: ...")
     with pytest.raises(ConfigError) as error:
         parse_config({"method": method}, where="a test")
-    assert_one_line(error.value, f"a test: method = '{method}': ", said)
+    assert_one_line(error.value, "a test: ", said)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from service.config import parse_config
-from service.config.skills import SkillsConfig, SkillsSACConfig
+from service.config.skills import SKILLS_OF, SkillsConfig, SkillsSACConfig
 from service.learner.off_policy import OffPolicyLoop
 from service.learner.replay import ReplayBuffer
 from service.learner.sac import SACLearner
 from service.learner.sac_networks import GaussianActor
+from service.methods.rewards import find_reward
 from service.methods.skill_learning import IntrinsicBatches, Seen, make_skill_loop, see_object
-from service.methods.skill_rewards import METHODS, make_reward
 from service.policies.frozen_skills import draw_skills
 
 NUM, LENGTH, STEP_M = 32, 10, 0.2
@@ -24,7 +24,7 @@ class PointMasses:
     def __init__(self, method):
         self._rng, self._method = np.random.default_rng(0), method
         self.at, self.elapsed = np.zeros((NUM, 2), np.float32), 0
-        self.skill = draw_skills(method, NUM, 2, self._rng)
+        self.skill = draw_skills(SKILLS_OF[method][0], NUM, 2, self._rng)
 
     def inputs(self):
         return np.concatenate((self.at, self.skill), axis=1)
@@ -36,7 +36,7 @@ class PointMasses:
         ended = np.full(NUM, self.elapsed % LENGTH == 0)
         self.at = np.where(ended[:, None], np.float32(0.0), after)
         if ended.all():
-            self.skill = draw_skills(self._method, NUM, 2, self._rng)
+            self.skill = draw_skills(SKILLS_OF[self._method][0], NUM, 2, self._rng)
         return columns, ended
 
 
@@ -57,7 +57,7 @@ def where_skills_lead(loop, skills):
     return at
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", SKILLS_OF)
 def test_skills_of_a_point_mass_differ(method):
     """A skill leads somewhere else than others do: its end tells which of the skills it was."""
     sac = SkillsSACConfig(
@@ -67,12 +67,12 @@ def test_skills_of_a_point_mass_differ(method):
     config = SkillsConfig(
         method=method, size=2, hidden_sizes=(64, 64), learning_rate=1e-3, num_alternatives=20, dual_initial=3.0, sac=sac
     )
-    reward = make_reward(config, 2, seed=0)
-    learner = SACLearner(GaussianActor(4, 2, (64, 64)), 4, 2, sac, seed=0)
+    reward = find_reward(config.method, {})(config, 2, 0)
+    learner = SACLearner(GaussianActor(4, 2, (64, 64)), 4, 2, sac, 0, 2 if reward.pays_features else None)
     replay = ReplayBuffer(1000, NUM, {"before": 2, "after": 2, "skill": 2, "action": 2})
     loop = OffPolicyLoop(PointMasses(method), replay, learner, IntrinsicBatches(reward, config, see), 0)
     loop.play(NUM * 180)
-    skills = np.repeat(draw_skills(method, 12, 2, np.random.default_rng(1)), 3, axis=0)
+    skills = np.repeat(draw_skills(SKILLS_OF[method][0], 12, 2, np.random.default_rng(1)), 3, axis=0)
     skills = skills + np.float32(0.02) * np.random.default_rng(2).standard_normal(skills.shape, dtype=np.float32)
     ends = where_skills_lead(loop, skills)
     assert np.linalg.norm(ends, axis=1).mean() > 0.5  # of 2 m at most, along an axis
@@ -85,11 +85,11 @@ def test_skills_of_a_point_mass_differ(method):
         assert abs(np.linalg.det(fit[:2])) > 0.05
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", SKILLS_OF)
 def test_losing_the_object_gives_back_what_moving_it_has_earned(method):
     """It is seen where the episode began. The network learns from steps alone, and so is DADS paid."""
     config = small_config(method=method).skills
-    reward = make_reward(config, 3, seed=0)
+    reward = find_reward(config.method, {})(config, 3, 0)
     start, edge, gone = (0.0, 0.05, 0.025), (0.12, 0.05, 0.025), (0.3, 0.05, -2.0)
     places = np.float32([start, edge, gone, gone])  # after each of three steps
     rows = {name: np.zeros((3, 11), np.float32) for name in ("previous", "positions", "following")}
@@ -138,7 +138,7 @@ def small_config(**skills):
     return parse_config({"method": "skills", "skills": tree, "world": world, "run": run}, where="a test")
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", SKILLS_OF)
 def test_a_loop_in_worlds_goes_on_bit_for_bit(method):
     loops = [make_skill_loop(small_config(method=method))[0] for _ in range(2)]
     first, second = loops

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from service.config.skills import SkillsConfig
-from service.methods.skill_rewards import METHODS, make_reward
+from service.config.skills import SKILLS_OF, SkillsConfig
+from service.methods.rewards import find_reward
 from service.policies.frozen_skills import draw_skills
 
 BEFORE = torch.tensor([[0.1, 0.2, 0.0], [1.0, -1.0, 0.5], [0.0, 0.0, 0.0]])
@@ -17,7 +17,7 @@ SKILL = torch.tensor([[1.0, 0.0], [0.5, -2.0], [-1.0, 1.0]])
 
 def make(method, **settings):
     config = SkillsConfig(method=method, size=2, hidden_sizes=(5,), **settings)
-    return make_reward(config, 3, seed=0)
+    return find_reward(config.method, {})(config, 3, 0)
 
 
 def network_of(reward, rows):
@@ -109,15 +109,29 @@ def test_metra_by_hand():
 
 def test_the_duals_loss_moves_no_weight_of_phi_and_phis_not_the_dual():
     reward = make("metra")
-    loss = reward._loss(BEFORE, AFTER, SKILL)
+    loss = reward.loss(BEFORE, AFTER, SKILL)
     (gradient,) = torch.autograd.grad(loss, reward._log_dual)
     step = network_of(reward, AFTER) - network_of(reward, BEFORE)
     assert gradient.item() == pytest.approx(np.minimum(1.0 - (step**2).mean(1), 1e-3).mean(), rel=1e-4)
 
 
+def test_csf_by_hand():
+    reward = make("csf")
+    step = network_of(reward, AFTER) - network_of(reward, BEFORE)
+    np.testing.assert_allclose(reward.rewards(BEFORE, AFTER, SKILL), step, atol=1e-5)
+    scores = step @ SKILL.numpy().T
+    expected = (5.0 * np.log(np.exp(scores).mean(1)) - np.diag(scores)).mean()
+    assert reward.learn(BEFORE, AFTER, SKILL) == pytest.approx(expected, rel=1e-4)
+
+
+def test_what_is_known_without_the_classes_is_what_they_say():
+    found = {name: find_reward(name, {}) for name in SKILLS_OF}
+    assert {name: (each.prior, each.zero_shot) for name, each in found.items()} == SKILLS_OF
+
+
 def test_priors():
     rng = np.random.default_rng(0)
-    drawn = {name: draw_skills(name, 4000, 3, rng) for name in METHODS}
+    drawn = {name: draw_skills(SKILLS_OF[name][0], 4000, 3, rng) for name in SKILLS_OF}
     assert all(skills.shape == (4000, 3) and skills.dtype == np.float32 for skills in drawn.values())
     for name in ("lsd", "diayn"):
         assert drawn[name].std() == pytest.approx(1.0, abs=0.03)
@@ -127,9 +141,9 @@ def test_priors():
     assert drawn["dads"].std() == pytest.approx(1 / math.sqrt(3), abs=0.02)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", SKILLS_OF)
 def test_it_continues_bit_for_bit_where_it_was_saved(method):
-    first, second = make(method), make_reward(SkillsConfig(method=method, size=2, hidden_sizes=(5,)), 3, seed=7)
+    first, second = make(method), find_reward(method, {})(SkillsConfig(method=method, size=2, hidden_sizes=(5,)), 3, 7)
     first.learn(BEFORE, AFTER, SKILL)
     first.rewards(BEFORE, AFTER, SKILL)
     second.load_state(first.state())

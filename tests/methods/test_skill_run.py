@@ -11,6 +11,7 @@ from service.base.jsonl import read_jsonl
 from service.cluster.ray_connection import ClusterOptions
 from service.cluster.ray_runtime import RayRuntime
 from service.config import parse_config
+from service.config.skills import SkillsConfig
 from service.policies.frozen_skills import FrozenSkills, SkillPlayer
 from service.registry.registry import Registry
 from service.runs.train import open_run, train
@@ -118,8 +119,8 @@ def published(tmp_path_factory):
 
 
 def test_published_skills_are_those_of_the_run(published):
-    loaded = service.load_skills("cube-lsd@1", published / "registry")
-    own = service.load_skills(str(published / "run"))
+    loaded = service.load("cube-lsd@1", published / "registry")
+    own = service.load(str(published / "run"))
     assert loaded.manifest.spaces["kind"] == "skills"
     assert loaded.skills.size == own.skills.size == loaded.manifest.spaces["skill"] == 4
     assert loaded.skills.method == "lsd"
@@ -138,7 +139,7 @@ def test_published_skills_are_those_of_the_run(published):
 
 
 def test_a_player_sees_how_things_moved(published):
-    skills = service.load_skills("cube-lsd", published / "registry").skills
+    skills = service.load("cube-lsd", published / "registry").skills
     rng = np.random.default_rng(0)
     skill, first, second = skills.draw(3, rng), *rng.uniform(0.0, 0.1, (2, 3, 11)).astype(np.float32)
     player = SkillPlayer(skills, skill)
@@ -154,21 +155,18 @@ class TestBadInput:
         assert "\n" not in str(caught.value)
 
     def test_skills_where_primitives_are_expected(self, published):
-        words = r"is a set of skills of lsd; load_primitives needs primitives$"
+        words = r"is a set of skills of lsd; tandem x needs primitives$"
         for reference in ("cube-lsd@1", str(published / "run")):
-            self.refused(words, service.load_primitives, reference, published / "registry")
-
-    def test_primitives_where_skills_are_expected(self, tmp_path):
-        words = r"is a set of primitives; load_skills needs skills$"
-        self.refused(words, service.load_skills, "panda-cube@champion", tmp_path)
+            loaded = service.load(reference, published / "registry")
+            self.refused(words, loaded.expect, "primitives", by="tandem x")
 
     def test_zero_shot_by_dads(self, published):
         parameters = Registry(published / "registry").load("cube-lsd@1")[1]
-        dads = FrozenSkills(parameters, "dads")
-        self.refused("DADS lead to no given goal", dads.towards, np.zeros((1, 11), np.float32), np.zeros((1, 3)))
+        dads = FrozenSkills(parameters, SkillsConfig(method="dads"))
+        self.refused("skills of dads lead to no goal", dads.towards, np.zeros((1, 11), np.float32), np.zeros((1, 3)))
 
     def test_parameters_of_something_else(self):
-        self.refused("not of skills", FrozenSkills, {"gate.0.weight": np.zeros((2, 2), np.float32)}, "lsd")
+        self.refused("not of skills", FrozenSkills, {"gate.0.weight": np.zeros((2, 2), np.float32)}, SkillsConfig())
 
     def test_on_a_cluster(self, tmp_path):
         self.refused(

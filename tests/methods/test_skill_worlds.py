@@ -46,7 +46,7 @@ def test_a_held_skill_is_so_many_steps_of_the_frozen_policy(skills, hold):
             if not over.any():
                 last = step
                 reward += step["reward"][:, 0]
-            over |= plain.env._elapsed == 0
+            over |= plain.env.rules.elapsed == 0
         for name, expected in zip(("previous", "positions", "goal"), start, strict=True):
             np.testing.assert_array_equal(columns[name], expected)
         np.testing.assert_array_equal(columns["before"], last["positions"])
@@ -131,7 +131,7 @@ class TestBadInput:
             METHODS["lsd"].check(made("dads"))
 
     def test_skills_of_another_robot(self, registry):
-        trained = service.load_skills("made", registry)
+        trained = service.load("made", registry)
         spaces = {**trained.manifest.spaces, "action": 7}
         other = dataclasses.replace(trained, manifest=trained.manifest.model_copy(update={"spaces": spaces}))
         with pytest.raises(

@@ -13,7 +13,7 @@ from service.base.errors import TandemError
 from service.config.find import METHODS as KNOWN
 from service.config.task import TaskConfig
 from service.envs.observations import layouts
-from service.envs.tasks import TASKS
+from service.envs.tasks import find_task
 from service.methods import task_evaluation
 from service.methods.task import TaskLearning
 from service.methods.task_methods import METHODS
@@ -113,7 +113,7 @@ def test_what_it_leaves(home, champion):
             assert (share - bound) ** 2 == pytest.approx(1.96**2 * bound * (1.0 - bound) / 6, abs=1e-12)
     config, trial = RunDirectory(path).read_config(), read_status(path).trial
     assert (config.primitives, config.primitives_digest) == (champion.manifest.reference, champion.digest)
-    assert (config.world, config.task_version) == (champion.config.world, TASKS["push"].version)
+    assert (config.world, config.task_version) == (champion.config.world, find_task("push").version)
     assert (trial.task, trial.method, trial.primitives) == ("push", "ours", champion.manifest.reference)
 
 
@@ -146,7 +146,7 @@ def test_a_resume_may_say_what_began_the_run(home, tmp_path):
 
 
 def test_5_cm_are_counted_and_while_learning_a_centimetre_less_is_paid(champion, monkeypatch):
-    counts, task = [], TASKS["push"]
+    counts, task = [], find_task("push")
     for distance in (0.05, 0.06):
         world = task.world_from(champion.config.world)
         options = {"num_episodes": 60, "num_steps": 50, "success_distance_m": distance, "seed": 2_000_007}
@@ -157,7 +157,8 @@ def test_5_cm_are_counted_and_while_learning_a_centimetre_less_is_paid(champion,
     worlds = method.loop.worlds
     following = np.zeros((3, 11), np.float32)
     following[:, 5:8] = [[0.0399, 0.0, 0.0], [0.0401, 0.0, 0.0], [0.0, 0.0, -0.0499]]
-    np.testing.assert_array_equal(worlds.rewards(following, np.zeros((3, 3), np.float32)), [1.0, 0.0, 0.0])
+    rewards = worlds.rewards({"following": following}, np.zeros((3, 3), np.float32))
+    np.testing.assert_array_equal(rewards, [1.0, 0.0, 0.0])
     worlds.close()
 
 
@@ -194,20 +195,20 @@ def acted(orchestrator, observation):
 def refused(*arguments, **options):
     """The one line by which loading is refused."""
     with pytest.raises(TandemError) as refusal:
-        service.load_policy(*map(str, arguments), **options)
+        service.load(*map(str, arguments), **options)
     assert_one_line(refusal.value)
     return str(refusal.value)
 
 
 def test_it_acts_alike_from_its_directory_a_registry_and_a_service(home, champion, observation, tmp_path):
     run, registry = str(home / "runs" / "ours"), home / "registry"
-    local = service.load_policy(run, registry)
+    local = service.load(run, registry)
     expected = acted(local, observation)
     assert expected.shape == (2, 3, 4)
     assert (expected[0] != champion.policy.act_deterministic(observation)).any()
-    assert (local.task, local.method, local.world.gripper) == ("push", "ours", "blocked")
+    assert (local.task.name, local.method, local.world.gripper) == ("push", "ours", "blocked")
     checkpoint = next((home / "runs" / "ours" / "checkpoints").iterdir())
-    np.testing.assert_array_equal(acted(service.load_policy(str(checkpoint), registry), observation), expected)
+    np.testing.assert_array_equal(acted(service.load(str(checkpoint), registry), observation), expected)
 
     manifest = Registry(registry).manifest("push-ours")
     result = RunDirectory(home / "runs" / "ours").read_result()
@@ -219,12 +220,12 @@ def test_it_acts_alike_from_its_directory_a_registry_and_a_service(home, champio
         assert for_robot(found).world == found.nominal.world == local.world
         np.testing.assert_array_equal(acted(found, observation), expected)
     Registry(registry).export("push-ours", tmp_path / "exported")
-    exported = service.load_policy(str(tmp_path / "exported"), tmp_path / "no-registry")
+    exported = service.load(str(tmp_path / "exported"), tmp_path / "no-registry")
     np.testing.assert_array_equal(acted(exported, observation), expected)
 
     with serve(home) as server, pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-        fetched = service.load_policy("push-ours@latest", server.url)
+        fetched = service.load("push-ours@latest", server.url)
         (listed,) = httpx.get(f"{server.url}/v1/primitives/push-ours").json()["versions"]
     assert (listed["kind"], listed["task"]) == ("orchestrator", "push")
     assert listed["primitives"] == champion.manifest.reference
@@ -241,7 +242,7 @@ def test_another_version_of_that_name_does_not_pass_for_its_primitives(home, cha
         parameters["gate.output.bias"] = parameters["gate.output.bias"] + np.float32(1.0)
         own.publish(manifest.name, parameters, **fields)
     run = home / "runs" / "ours"
-    found = service.load_policy(str(run), own.root)
+    found = service.load(str(run), own.root)
     assert found.trained.label == f"{champion.manifest.reference} (bundled)"
 
     reason = refused(run, own.root, primitives=f"{manifest.name}@{number}")
@@ -262,10 +263,8 @@ def test_another_version_of_that_name_does_not_pass_for_its_primitives(home, cha
 
 def test_orchestrators_and_primitives_are_not_taken_for_each_other(home, champion):
     registry, before = home / "registry", files_in(home / "registry")
-    for load in (service.load_primitives, service.load_skills):
-        with pytest.raises(TandemError, match=f"@1 is a policy of the task push; {load.__name__} needs "):
-            load("push-ours@latest", registry)
-    assert "is a set of primitives; load_policy needs a policy of a task" in refused("panda-cube@champion", registry)
+    with pytest.raises(TandemError, match="@1 is a policy of the task push; tandem x needs primitives"):
+        service.load("push-ours@latest", registry).expect("primitives", by="tandem x")
     for where, changes, said in (
         (registry, {"name": champion.manifest.name}, "panda-cube is the name of primitives already"),
         (registry, {"method": "scratch-monolithic"}, "the method scratch-monolithic acts with no primitives"),
@@ -282,7 +281,7 @@ def test_orchestrators_and_primitives_are_not_taken_for_each_other(home, champio
 
 
 def test_a_policy_from_nothing_needs_the_world_alone(home, champion, observation, tmp_path):
-    found = service.load_policy(str(home / "runs" / "scratch-monolithic"), tmp_path)
+    found = service.load(str(home / "runs" / "scratch-monolithic"), tmp_path)
     assert found.trained is None
     assert acted(found, observation).shape == (2, 3, 4)
     for wrong, said in (
@@ -324,7 +323,8 @@ def test_a_manifest_that_lacks_what_an_orchestrator_needs(tmp_path):
         ({"world": {"friction": 0.5}}, "a task is learned in the world of its primitives; leave out world"),
         ({"primitives": "nothing@1"}, "nothing"),
         ({"method": "lsd"}, r"panda-cube@.* is a set of primitives; the method LSD skills needs skills"),
-        ({"skill_steps": 51}, "skill_steps = 51"),
+        ({"method": "lsd", "skill_steps": 51}, "skill_steps 51: an episode has 50 steps"),
+        ({"skill_steps": 51}, "skill_steps is for methods that take skills, and ours takes none"),
         ({"reward_margin_m": 0.05}, "reward_margin_m = 0.05"),
     ],
 )

@@ -65,7 +65,7 @@ def test_relabelled_goals_are_where_the_object_came_to_later_in_the_episode(cham
     seen, paid = [], []
     worlds = loop.worlds
     rewards = worlds.rewards
-    worlds.rewards = lambda following, goal: seen.append((following, goal)) or rewards(following, goal)
+    worlds.rewards = lambda rows, goal: seen.append((rows["following"], goal)) or rewards(rows, goal)
     batch = Hindsight(worlds, (1.0, 1.0))(loop.replay, 400, np.random.default_rng(0))
     ((following, goal),) = seen
     step, world, _ = (100 * following[:, 5:8]).round().astype(int).T

@@ -27,7 +27,7 @@ def ours():
 
 
 def test_transitions_are_those_of_single_environments(ours):
-    name = "service.envs.gym.registration:tandem/Push-v1"
+    name = "tandem_skills:tandem/Push-v1"
     single = [gymnasium.make(name, config=CONFIG, max_episode_steps=LENGTH) for _ in range(NUM)]
     seen = [env.reset(seed=SEED + world)[0] for world, env in enumerate(single)]
     before, rng, returns, ends = [each["observation"] for each in seen], np.random.default_rng(0), np.zeros(NUM), []
@@ -61,7 +61,7 @@ def test_a_world_that_ends_alone_begins_alone(ours):
     """Where physics diverged, one world starts anew in the middle of the others' episodes."""
     actions = np.full((NUM, 4), 0.5, dtype=np.float32)
     for _ in range(2):
-        ours.env._elapsed[1] = LENGTH - 1
+        ours.env.rules.elapsed[1] = LENGTH - 1
         columns, ended = ours.step(actions)
         assert ended.tolist() == [False, True, False]
         after, _ = ours.step(actions)
@@ -99,7 +99,7 @@ def test_restored_worlds_go_on_bit_for_bit(champion):
 def test_what_is_paid_for_another_goal(ours):
     following = np.zeros((3, 11), np.float32)
     following[:, 5:8] = [[0.0499, 0.0, 0.0], [0.0501, 0.0, 0.0], [0.0, 0.0, -0.0599]]
-    np.testing.assert_array_equal(ours.rewards(following, np.zeros((3, 3), np.float32)), [1.0, 0.0, 0.0])
+    np.testing.assert_array_equal(ours.rewards({"following": following}, np.zeros((3, 3), np.float32)), [1.0, 0.0, 0.0])
 
 
 def test_inputs_by_hand():

@@ -167,7 +167,7 @@ def test_every_kind_from_a_service_as_from_its_registry(tmp_path, monkeypatch):
     assert_one_line(error.value, server.url, "no 'nobody'")
     assert np.array_equal(fetched.act_deterministic(rows), bob.act_deterministic(rows))
     assert (fetched.kind, skills.kind, training.kind) == ("primitives", "skills", "orchestrator")
-    assert (training.trained.label, training.task, training.world.fixture) == ("made@1", "wall", "wall")
+    assert (training.trained.label, training.task.name, training.world.fixture) == ("made@1", "wall", "wall")
     assert training.primitives is training.trained.policy
     local = load(str(tmp_path / "training"), registry.root)
     assert np.array_equal(training.player().act_deterministic(rows), local.player().act_deterministic(rows))
@@ -199,8 +199,9 @@ def test_what_each_kind_has(kinds):
     for each in (bob, task, alone):
         with pytest.raises(TandemError, match="has no skills: it is a "):
             _ = each.skills
-    assert (bob.goals, bob.num_steps, bob.success_distance_m) == ("mixed", 4, bob.config.game.success_distance_m)
-    assert (task.goals, task.num_steps, task.success_distance_m, task.world.gripper) == ("table", 50, 0.05, "blocked")
+    assert (bob.goal_kind, bob.num_steps, bob.success_distance_m) == ("mixed", 4, bob.config.game.success_distance_m)
+    assert (task.goal_kind, task.num_steps, task.success_distance_m) == ("table", 50, 0.05)
+    assert task.world.gripper == "blocked"
     assert alone.trained is None
     assert alone.config.world == bob.config.world
     assert (bob.on("wall").title, bob.on("wall").world.fixture) == ("made@1 on Wall", "wall")

@@ -11,12 +11,12 @@ from tests.methods.skill_sets import made
 
 def test_a_bob_and_an_orchestrator_with_its_world(registry, tmp_path):
     bob = for_robot(load("panda-cube@champion", tmp_path))
-    assert (bob.goals, bob.world.fixture) == ("mixed", "none")
+    assert (bob.goal_kind, bob.world.fixture) == ("mixed", "none")
     robust = for_robot(load("panda-cube-robust@champion", tmp_path)).world
     assert (robust.nominal, robust.observed.delay) == (robust, True)  # a robot is one, not drawn from many
     write_training(tmp_path / "wall", publish_bob(registry), "ours", "wall")
     found = for_robot(load(str(tmp_path / "wall"), registry.root))
-    assert (found.name, found.goals, found.world.fixture) == ("wall-ours-0", "table", "wall")
+    assert (found.name, found.tried_on.goals, found.world.fixture) == ("wall-ours-0", "table", "wall")
     action = found.policy.act_deterministic(np.zeros((1, 22), dtype=np.float32))
     assert action.shape == (1, 4)
 

@@ -9,9 +9,9 @@ import time
 import numpy as np
 import pytest
 
-from service.actors import evaluation
 from service.base.errors import ConfigError
 from service.config import parse_config
+from service.envs import rules
 from service.envs.sampling import draw_goals
 from service.registry.registry import Registry
 from service.runs import train as module
@@ -94,7 +94,7 @@ def test_the_final_evaluation_is_played_on_goals_of_its_own(tmp_path, quick, mon
         drawn.append((kind, draw_goals(kind, *args, **kwargs)))
         return drawn[-1][1]
 
-    monkeypatch.setattr(evaluation, "draw_goals", watched)
+    monkeypatch.setattr(rules, "draw_goals", watched)
     done = run_pretrain(tmp_path, tiny_config(total_env_steps=400, evaluation_interval=1))
     *curve, final = (drawn[start : start + 3] for start in range(0, len(drawn), 3))
     assert len(curve) == done.iteration >= 2

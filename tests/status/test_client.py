@@ -36,7 +36,7 @@ LOAD = """
 import sys
 import service
 assert not {"httpx", "fastapi", "numpy"} & set(sys.modules)
-bob = service.load_primitives("panda-cube@champion", registry=sys.argv[1])
+bob = service.load("panda-cube@champion", registry=sys.argv[1])
 assert not {"torch", "fastapi", "uvicorn"} & set(sys.modules)
 print(bob.label)
 """
@@ -248,8 +248,8 @@ def champions(tmp_path_factory):
         yield server
 
 
-def test_load_primitives(champions):
-    bob, own = service.load_primitives("panda-cube@champion", registry=champions.url), service.load_primitives()
+def test_loading_the_champion(champions):
+    bob, own = service.load("panda-cube@champion", registry=champions.url), service.load()
     assert f"{bob.label} (bundled)" == own.label
     assert (bob.manifest, bob.config) == (own.manifest, own.config)
     rows = np.random.default_rng(0).standard_normal((5, 14)).astype(np.float32)
@@ -257,7 +257,7 @@ def test_load_primitives(champions):
     assert list((Path(os.environ["XDG_CACHE_HOME"]) / "tandem" / "registries").iterdir())
 
 
-def test_load_primitives_imports_neither_torch_nor_the_service(champions, tmp_path):
+def test_loading_imports_neither_torch_nor_the_service(champions, tmp_path):
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
     result = subprocess.run(
         [sys.executable, "-c", LOAD, champions.url],

@@ -11,12 +11,14 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from service.base.errors import TandemError
+from service.base.errors import TandemError, in_metres
 from service.base.types import BoolArray, FloatArray, StateArray
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.gym.goals import Goals, GoalSource, Success
 from service.envs.observations import ACTION, layouts
+from service.envs.rules import Rules
+from service.envs.sampling import inside_fixtures
+from service.envs.task import Task, View, view_of_places
 from service.envs.tasks import find_task
 
 if TYPE_CHECKING:
@@ -37,7 +39,9 @@ class EnvState:
     goal: StateArray
     """(N, 3) metres."""
     elapsed: NDArray[np.int64]
-    """(N,) steps of the episode; 0 in a ``TabletopEnv``, whose time limit is its wrapper's."""
+    """(N,) steps of the episode."""
+    memory: StateArray
+    """(N, M) of the task; (N, 0) where it keeps none."""
     random: tuple[dict[str, Any], ...]
     """State of each world's bit generator, which draws object and goal at the next reset."""
 
@@ -48,7 +52,7 @@ class GoalWorlds:
     Args: those of ``TabletopEnv`` and of ``WorldBatch``.
 
     Raises:
-        TandemError: unknown task or goals, goals that the world cannot have, a distance that is not positive.
+        TandemError: unknown task, goals that the world cannot have, a distance that is not positive.
     """
 
     def __init__(
@@ -56,27 +60,21 @@ class GoalWorlds:
         num_worlds: int,
         num_threads: int,
         config: WorldConfig | None,
-        task: str | None,
-        goals: Goals | None,
+        task: str | Task | None,
         success_distance_m: float,
-        success: Success | None,
     ) -> None:
         self.config = config or WorldConfig()
-        if task is not None:
-            if goals is not None:
-                raise TandemError(
-                    f"goals = {goals!r} beside task = {task!r}: the task has its own; give one of the two"
-                )
-            self.config, goals = find_task(task).world_from(self.config), find_task(task).goals
-        self.goals: Goals = goals if goals is not None else "mixed" if self.config.fixture == "none" else "table"
+        asked = find_task(task) if isinstance(task, str) else task
+        if asked is None:
+            asked = Task("Tabletop", goals="mixed" if self.config.fixture == "none" else "table")
+        self.config = asked.world_from(self.config)
         if not success_distance_m > 0.0:
             raise TandemError(f"success_distance_m = {success_distance_m}; give a distance above 0 m")
         self.success_distance_m = success_distance_m
-        self._success = success
         self._worlds = WorldBatch(self.config, num_worlds, num_threads=num_threads)
-        self._source = GoalSource(self.goals, self.config, self._worlds.reach, success_distance_m)
+        self.rules = Rules(asked, self._worlds, success_distance_m)
+        """What the task says, and what it remembers."""
         self._goal = self._worlds.object_position.copy()
-        self._elapsed = np.zeros(num_worlds, dtype=np.int64)
         self._random = [seeding.np_random()[0] for _ in range(num_worlds)]
 
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
@@ -85,24 +83,21 @@ class GoalWorlds:
         ``info`` is there for the convention of goal environments and is not read.
 
         Raises:
-            TandemError: the user's ``success`` gave no bool for each.
+            TandemError: the task needs more than places, or gives something else.
         """
-        achieved, desired = np.asarray(achieved_goal), np.asarray(desired_goal)
-        if self._success is None:
-            return (np.linalg.norm(achieved - desired, axis=-1) <= self.success_distance_m).astype(np.float64)
-        found = np.asarray(self._success(achieved, desired))
-        shape = np.broadcast_shapes(achieved.shape, desired.shape)[:-1]
-        if found.shape != shape or found.dtype != np.bool_:
-            raise TandemError(
-                f"success: the function gave {found.dtype} of shape {found.shape} for goals of shape {achieved.shape}; "
-                f"give bool of shape {shape}"
-            )
-        return found.astype(np.float64)
+        achieved, desired = np.broadcast_arrays(achieved_goal, desired_goal)
+        flat = achieved.reshape(-1, 3), desired.reshape(-1, 3)
+        return self.rules.reward(view_of_places(*flat)).reshape(achieved.shape[:-1])
+
+    def rewards_of(self, rows: FloatArray, goal: FloatArray) -> NDArray[np.float64]:
+        """(B,) rewards for steps that led to (B, V) ``View.rows``, had the goals (B, 3) been others, metres."""
+        return self.rules.reward(View.of_rows(rows, goal[:, None]))
 
     def state(self) -> EnvState:
         """Copy everything that :meth:`restore` needs."""
         random = tuple(deepcopy(dict(each.bit_generator.state)) for each in self._random)
-        return EnvState(self._worlds.states.copy(), self._goal.copy(), self._elapsed.copy(), random)
+        kept = self._goal.copy(), self.rules.elapsed.copy(), self.rules.memory.copy()
+        return EnvState(self._worlds.states.copy(), *kept, random)
 
     def restore(self, state: EnvState) -> Observation:
         """Go back to a saved state, of this or another environment of the same config; continues bit-identically.
@@ -116,7 +111,8 @@ class GoalWorlds:
         if state.worlds.shape != self._worlds.states.shape:
             raise ValueError(f"states: expected shape {self._worlds.states.shape}, got {state.worlds.shape}")
         self._worlds.restore(state.worlds)
-        self._goal, self._elapsed = state.goal.copy(), state.elapsed.copy()
+        self._goal = state.goal.copy()
+        self.rules.elapsed, self.rules.memory = state.elapsed.copy(), state.memory.copy()
         for generator, random in zip(self._random, state.random, strict=True):
             generator.bit_generator.state = deepcopy(random)
         return self._observe()[0]
@@ -131,20 +127,53 @@ class GoalWorlds:
         index = np.flatnonzero(worlds).tolist()
         starts = [self._worlds.draw_starts(self._random[world], 1) for world in index]
         self._worlds.restore(np.concatenate(starts), worlds)
+        self.rules.begin(worlds)
         for world in index:
             here = slice(world, world + 1)
-            self._goal[here] = self._source.draw(self._random[world], self._worlds.places.of(here))
+            self._goal[here] = self.rules.draw(self._random[world], here)
         if goal is not None:
             self._goal[:] = goal
-        self._elapsed[worlds] = 0
 
-    def _observe(self) -> tuple[Observation, BoolArray]:
-        """(N, ...) observations, and (N,) true where the object is at its goal."""
+    def _given(self, options: dict[str, Any] | None) -> StateArray | None:
+        """(N, 3) or (1, 3) goals that ``options`` of a reset give, metres; None where they give none.
+
+        Raises:
+            TandemError: another option, or a goal of another shape, out of reach or inside a fixture.
+        """
+        for name in (options or {}).keys() - {"goal"}:
+            raise TandemError(f"reset: unknown option {name!r}; the only one is goal")
+        if not options or options["goal"] is None:
+            return None
+        goal, num = np.array(options["goal"], dtype=np.float64), self._worlds.num_worlds
+        if goal.shape not in ((3,), (num, 3)):
+            raise TandemError(f"reset: options['goal'] has shape {goal.shape}, not (3,) or {(num, 3)}: give metres")
+        goal = goal.reshape(-1, 3)
+        for bad in goal[self.rules.out_of_reach(goal)]:
+            near = in_metres(self.rules.nearest(bad[None])[0])
+            raise TandemError(
+                f"reset: options['goal'] ({in_metres(bad)}) m is out of reach: the nearest the arm comes is ({near}) m"
+            )
+        for bad in goal[inside_fixtures(goal, self.config)]:
+            raise TandemError(
+                f"reset: options['goal'] ({in_metres(bad)}) m: the object would be inside a fixture, or the upright "
+                "box around it"
+            )
+        return goal
+
+    def _advance(self, actions: FloatArray) -> BoolArray:
+        """Act by (N, 4) actions; (N,) whose physics diverged."""
+        diverged = self._worlds.step(np.asarray(actions, dtype=np.float32))
+        self.rules.advance(self._goal)
+        return diverged
+
+    def _observe(self) -> tuple[Observation, View]:
+        """(N, ...) observations, and what success and reward see: places as observed, where both are ours."""
         positions = np.clip(self._worlds.positions(), -_FURTHEST_M, _FURTHEST_M)
         achieved = np.clip(self._worlds.object_position, -_FURTHEST_M, _FURTHEST_M).astype(np.float32)  # without noise
         desired = self._goal.astype(np.float32)
         observation = {"observation": positions, "achieved_goal": achieved, "desired_goal": desired}
-        return observation, self.compute_reward(achieved, desired, {}) > 0.0
+        own = self.rules.task.is_own
+        return observation, self.rules.view(self._goal) if own else view_of_places(achieved, desired)
 
 
 def goal_space(config: WorldConfig) -> gymnasium.spaces.Dict:
@@ -168,28 +197,25 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
       frame, metres, within +-10.
     - action: (4,) in [-1, 1]: way x, y, z from where the end effector is now to its set-point (1 is 5 cm, of which the
       arm covers about 3 cm in a step), change of the finger width (1 is 10 cm).
-    - reward: 1 at every step the object is within ``success_distance_m`` of the goal, else 0 (paper, downstream tasks).
-    - never terminates; truncated where the physics diverged, else by the time limit of the registration.
+    - reward: 1 at every step the object is within ``success_distance_m`` of the goal, else 0 (paper, downstream tasks);
+      or what the task says.
+    - never terminates; truncated where the physics diverged, or the steps of the task are over. For others than
+      these: ``task=replace(find_task("push"), episode_steps=100)``.
 
     ``info`` holds ``is_success`` (bool) and, after a step, ``diverged`` (bool).
 
     Args:
         config: the world; the paper's by default.
-        task: name of a downstream task (``service.envs.tasks``), which replaces part of ``config`` and has its goals.
-        goals: where goals are: ``table``, ``air``, ``volume``, or ``mixed`` as in most of the paper's downstream tasks,
-            which is the default; with a wall or a box in ``config`` only ``table``. Or a function
-            ``(rng, num, world) -> (num, 3)`` that draws them, metres. Or a box to draw them from, as its lowest and its
-            highest corner ``((x, y, z), (x, y, z))``, metres; they are clear of fixtures and obstacles.
+        task: a downstream task, by name or file as commands take it, or as an object. It replaces part of ``config``,
+            and has its goals, success and reward.
         success_distance_m: greatest distance that counts as reached, metres.
-        success: what counts instead of that distance: ``(achieved, desired) -> bool`` of (..., 3) goals to (...). The
-            reward is 1 where it is true, and ``info["is_success"]`` says so.
         render_mode: ``rgb_array`` or None.
         width: of rendered images, pixels.
         height: of rendered images, pixels.
 
     Raises:
-        TandemError: unknown ``task``, ``goals`` or ``render_mode``, a box out of reach, or a success distance that is
-            not positive.
+        TandemError: unknown ``task`` or ``render_mode``, goals that the world cannot have, or a distance that is not
+            positive.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012 - as the base class has it
@@ -198,17 +224,15 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
         self,
         config: WorldConfig | None = None,
         *,
-        task: str | None = None,
-        goals: Goals | None = None,
+        task: str | Task | None = None,
         success_distance_m: float = 0.05,
-        success: Success | None = None,
         render_mode: str | None = None,
         width: int = 640,
         height: int = 480,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise TandemError(f"TabletopEnv: render_mode = {render_mode!r}; choose rgb_array or None")
-        super().__init__(1, 1, config, task, goals, success_distance_m, success)
+        super().__init__(1, 1, config, task, success_distance_m)
         self.np_random, self.render_mode = self._random[0], render_mode
         self.observation_space = goal_space(self.config)
         self.action_space = action_space()
@@ -228,12 +252,12 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
         Raises:
             TandemError: an unknown option, a goal of another shape, not finite, out of reach or inside a fixture.
         """
-        goal = self._source.given(options, 1)
+        goal = self._given(options)
         super().reset(seed=seed, options=options)
         self._random = [self.np_random]
         self._start(np.ones(1, dtype=bool), goal)
-        observation, success = self._observe_first()
-        return observation, {"is_success": success}
+        observation, view = self._observe()
+        return _first(observation), {"is_success": bool(self.rules.success(view)[0])}
 
     def step(self, action: FloatArray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Act for one control step.
@@ -241,9 +265,11 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
         Raises:
             ValueError: action of the wrong shape or not finite.
         """
-        diverged = bool(self._worlds.step(np.asarray(action, dtype=np.float32)[None])[0])
-        observation, success = self._observe_first()
-        return observation, float(success), False, diverged, {"is_success": success, "diverged": diverged}
+        diverged = bool(self._advance(np.asarray(action, dtype=np.float32)[None])[0])
+        observation, view = self._observe()
+        truncated = diverged or bool(self.rules.elapsed[0] >= self.rules.task.episode_steps)
+        info = {"is_success": bool(self.rules.success(view)[0]), "diverged": diverged}
+        return _first(observation), float(self.rules.reward(view)[0]), False, truncated, info
 
     def restore(self, state: EnvState) -> Observation:
         """Go back to a saved state; see ``GoalWorlds``."""
@@ -265,10 +291,6 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
             self._renderer.close()
             self._renderer = None
         self._worlds.close()
-
-    def _observe_first(self) -> tuple[Observation, bool]:
-        observation, success = self._observe()
-        return _first(observation), bool(success[0])
 
 
 def _first(observation: Observation) -> Observation:

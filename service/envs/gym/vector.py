@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from service.base.types import BoolArray, FloatArray
 from service.config import WorldConfig
-from service.envs.gym.goals import Goals, Success
 from service.envs.gym.tabletop import GoalWorlds, Observation, action_space, goal_space
+from service.envs.task import Task
 
 Info = dict[str, Any]
 
@@ -27,20 +27,19 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
     s + i, under a time limit. An episode that ends starts anew within the same step
     (``gymnasium.vector.AutoresetMode.SAME_STEP``): the observation is the first of the next episode, and
     ``info["final_obs"]`` and ``info["final_info"]`` hold the last of the old one, laid out as by
-    ``gymnasium.vector.SyncVectorEnv``. All other ``info`` is as that class has it, too.
+    ``gymnasium.vector.SyncVectorEnv``. All other ``info`` is as that class has it, too, but for ``info["view"]``: where
+    success or reward are the task's own functions, ``View.rows`` of what they saw.
 
     Args:
         num_envs: N.
         config: the world; the paper's by default.
         task: see ``TabletopEnv``.
-        goals: see ``TabletopEnv``; a function is asked for the goal of one world at a time.
         success_distance_m: greatest distance that counts as reached, metres.
-        success: see ``TabletopEnv``.
-        max_episode_steps: where episodes are truncated.
+        max_episode_steps: where episodes are truncated; None: where the task says.
         num_threads: native threads; 0 for one per core.
 
     Raises:
-        TandemError: unknown ``task`` or ``goals``, or a distance that is not positive.
+        TandemError: unknown ``task``, goals that the world cannot have, or a distance that is not positive.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - as the base class has it
@@ -50,16 +49,14 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         num_envs: int = 1,
         config: WorldConfig | None = None,
         *,
-        task: str | None = None,
-        goals: Goals | None = None,
+        task: str | Task | None = None,
         success_distance_m: float = 0.05,
-        success: Success | None = None,
-        max_episode_steps: int = 50,
+        max_episode_steps: int | None = None,
         num_threads: int = 0,
     ) -> None:
-        super().__init__(num_envs, num_threads, config, task, goals, success_distance_m, success)
+        super().__init__(num_envs, num_threads, config, task, success_distance_m)
         self.num_envs = num_envs
-        self.max_episode_steps = max_episode_steps
+        self.max_episode_steps = max_episode_steps or self.rules.task.episode_steps
         self.single_observation_space, self.single_action_space = goal_space(self.config), action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -78,7 +75,7 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
             ValueError: not one seed per world.
             TandemError: an unknown option, a goal of another shape, not finite or out of reach.
         """
-        goal = self._source.given(options, self.num_envs)
+        goal = self._given(options)
         seeds = [seed + world for world in range(self.num_envs)] if isinstance(seed, int) else seed
         if seeds is not None:
             if len(seeds) != self.num_envs:
@@ -87,8 +84,8 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
                 if each is not None:
                     self._random[world] = seeding.np_random(each)[0]
         self._start(np.ones(self.num_envs, dtype=bool), goal)
-        observation, success = self._observe()
-        return observation, _with_masks({"is_success": success})
+        observation, view = self._observe()
+        return observation, _with_masks({"is_success": self.rules.success(view)})
 
     def step(self, actions: FloatArray) -> tuple[Observation, NDArray[Any], BoolArray, BoolArray, Info]:
         """Act for one control step in every world; see the class for what happens where an episode ends.
@@ -96,18 +93,18 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         Raises:
             ValueError: actions of the wrong shape or not finite.
         """
-        diverged = self._worlds.step(np.asarray(actions, dtype=np.float32))
-        self._elapsed += 1
-        observation, success = self._observe()
-        reward = success.astype(np.float64)
-        truncated = diverged | (self._elapsed >= self.max_episode_steps)
-        info: Info = {}
+        diverged = self._advance(actions)
+        observation, view = self._observe()
+        success, reward = self.rules.success(view), self.rules.reward(view)
+        truncated = diverged | (self.rules.elapsed >= self.max_episode_steps)
+        info: Info = _with_masks({"view": view.rows()}) if self.rules.task.is_own else {}
         if truncated.any():
-            info = _with_masks({"final_obs": _rows(observation, truncated)}, truncated)
+            info |= _with_masks({"final_obs": _rows(observation, truncated)}, truncated)
             last = {"is_success": success & truncated, "diverged": diverged}
             info |= _with_masks({"final_info": _with_masks(last, truncated)}, truncated)
             self._start(truncated)
-            observation, success = self._observe()
+            observation, view = self._observe()
+            success = self.rules.success(view)
         info |= _with_masks({"is_success": success})
         if not truncated.all():
             info |= _with_masks({"diverged": diverged & ~truncated}, ~truncated)

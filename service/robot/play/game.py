@@ -15,8 +15,8 @@ from service.base.types import FloatArray, StateArray
 from service.config.self_play import GameConfig, SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import bob_observation
-from service.envs.sampling import draw_goals, inside_fixtures
-from service.envs.tasks import EPISODE_STEPS
+from service.envs.rules import Rules
+from service.envs.sampling import inside_fixtures
 from service.generator.validity import FALLEN_BELOW_M, Verdict, classify_goal
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.registry.loading import Trained
@@ -43,16 +43,14 @@ class Game:
     def __init__(self, players: Trained, seed: int = 0) -> None:
         config, on_task = players.config, players.task is not None
         rules = config.game if isinstance(config, SelfPlayConfig) else GameConfig()
-        self.players, self.title, self.world = players, players.title, players.world
-        acting = players.trained or players
-        self.primitives = acting.policy if isinstance(acting.policy, NumpyMCPPolicy) else None
-        """What sliders drive."""
-        self.alice: StochasticPolicy | None = players.alice if rules.alice_plays else None
+        self.world = players.world
+        self.take(players)
         self._alice_steps, self._num_rounds = rules.alice_steps, rules.num_goals
-        self._bob_steps = EPISODE_STEPS if on_task else rules.bob_steps
-        self._hold_steps = EPISODE_STEPS // 4 if on_task else max(rules.bob_hold_steps, 1)
+        self._bob_steps = players.num_steps if on_task else rules.bob_steps
+        self._hold_steps = (players.num_steps // 4 or 1) if on_task else max(rules.bob_hold_steps, 1)
         self._rng = np.random.default_rng(seed)
         self.worlds = WorldBatch(self.world, 1, num_threads=1)
+        self._rules = Rules(players.tried_on, self.worlds, players.success_distance_m)
         self.step_s = self.world.physics_step_s * self.world.num_substeps
         self.mode: Mode = "goals"
         self.new_goals = True
@@ -71,6 +69,15 @@ class Game:
         self._start = self._end_state = self.worlds.states.copy()
         self._after: Literal["reset", "round", "bob"] = "reset"
         self.reset()
+
+    def take(self, players: Trained) -> None:
+        """Let these play from now on; of the same run, later ones."""
+        config, acting = players.config, players.trained or players
+        plays = not isinstance(config, SelfPlayConfig) or config.game.alice_plays
+        self.players, self.title = players, players.title
+        self.primitives = acting.policy if isinstance(acting.policy, NumpyMCPPolicy) else None
+        """What sliders drive."""
+        self.alice: StochasticPolicy | None = players.alice if plays else None
 
     def close(self) -> None:
         """Stop the world's threads."""
@@ -112,11 +119,12 @@ class Game:
     # --- what people do ----------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Begin anew: the arm at home, the object and the goal elsewhere."""
+        """Begin anew: the arm at home, the object elsewhere, and the goal, too, unless it was put where it is."""
         self.worlds.reset(self._rng)
         self._begin_turn("alice" if self.mode == "alice" else "bob")
         self._round = 0
-        self._draw_goal()
+        if self.new_goals:
+            self._draw_goal()
 
     def set_mode(self, mode: Mode) -> None:
         """Change who acts.
@@ -135,7 +143,7 @@ class Game:
             self._begin_turn("bob")
 
     def set_goal(self, goal: StateArray) -> None:
-        """Put the goal at (3,) metres, or the nearest place in the workspace; Bob goes there and stays.
+        """Put the goal at (3,) metres, or the nearest place in the workspace; Bob goes there and stays, or tries again.
 
         Where the object would be inside a fixture there is no goal: it stays where it was.
         """
@@ -160,6 +168,7 @@ class Game:
                 self._go_on()
             return
         diverged = bool(self.worlds.step(self._action())[0])
+        self._rules.advance(self.goal[None])
         self._steps += 1
         if diverged or self.worlds.object_position[0, 2] < FALLEN_BELOW_M:
             self._pause("the object fell off the table" if not diverged else "the physics diverged", "reset")
@@ -184,14 +193,17 @@ class Game:
 
     def _follow_bob(self) -> None:
         distance_m = float(np.linalg.norm(self.worlds.object_position[0] - self.goal))
-        there = distance_m <= self.players.success_distance_m
+        there, own = bool(self._rules.solved(self.goal[None])[0]), self._rules.task.success is not None
         self._held = self._held + 1 if there else 0
-        self.caption = f"At the goal, {100 * distance_m:.1f} cm away" if there else f"On the way: {self._seconds()}"
-        solved, late = self._held >= self._hold_steps, self._steps >= self._bob_steps
+        self.caption = f"On the way: {self._seconds()}"
+        if there:
+            self.caption = "Solved" if own else f"At the goal, {100 * distance_m:.1f} cm away"
+        put = self.mode == "goals" and not self.new_goals  # by hand, and so from anywhere: it may take longer
+        solved, late = self._held >= self._hold_steps, self._steps >= self._bob_steps * (1 + put)
         if self.mode == "alice":
             if solved or late:
                 self._pause(f"Bob: solved after {self._seconds()}" if solved else "Bob: not solved", "round")
-        elif self.new_goals and late and not there:
+        elif late and not there:  # who learns may be stuck for ever otherwise
             self._pause(f"Not there in {self._seconds()}", "reset")
         elif self.new_goals and solved and self._steps >= 1 / self.step_s:  # a goal beside the object is seen, too
             if self.world.fixture == "none":
@@ -230,17 +242,12 @@ class Game:
         self._turn, self._steps, self._held, self._still_steps = turn, 0, 0, 0
         self._start = self.worlds.states.copy()
         self.caption = "Alice proposes" if turn == "alice" else "On the way"
+        self._rules.begin(np.ones(1, dtype=bool))
         if forget:
             self.players.begin()
 
     def _draw_goal(self) -> None:
-        self.goal = draw_goals(
-            self.players.goals,
-            self._rng,
-            self.world,
-            self.players.success_distance_m,
-            self.worlds.places,
-        )[0]
+        self.goal = self._rules.draw(self._rng)[0]
 
     def _seconds(self) -> str:
         return f"{self._steps * self.step_s:.1f} s"

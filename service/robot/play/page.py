@@ -19,6 +19,7 @@ from service.envs.rendering.camera import DEFAULT_VIEW
 from service.envs.rendering.decoration import decorate
 from service.envs.rendering.renderer import goal_color
 from service.envs.scene import build_layout, build_spec
+from service.robot.play.following import Learning
 from service.robot.play.game import Game, Mode
 
 _HIDDEN = ("volume",)
@@ -108,14 +109,25 @@ class LiveScene:
 
 
 class Panel:
-    """GUI of a ``viser`` server."""
+    """GUI of a ``viser`` server.
 
-    def __init__(self, server: Any, game: Game) -> None:
+    Args:
+        server: shows it.
+        game: that is played.
+        follows: whether its players still learn.
+    """
+
+    def __init__(self, server: Any, game: Game, *, follows: bool = False) -> None:
         self._game, self._todo = game, queue.SimpleQueue[Callable[[], None]]()
         self._told: dict[tuple[int, str], Any] = {}
         self.paused = False
         self.speed = 1.0
         gui = server.gui
+        self._learning: Learning | None = None
+        if follows:
+            self._learned, self._success = gui.add_markdown(""), gui.add_progress_bar(0.0)
+            with gui.add_folder("Where Bob solves goals"):
+                self._map = gui.add_image(np.full((1, 1, 3), 225, dtype=np.uint8), format="png")
         self.caption = gui.add_markdown("")
         self.mode = gui.add_dropdown("Who acts", [_TITLES[mode] for mode in game.modes])
         self.pause = gui.add_button("Pause")
@@ -154,6 +166,18 @@ class Panel:
             self._tell(slider, "disabled", not own)
             if not own and weights is not None:
                 self._tell(slider, "value", round(float(weights[place]), 2))
+
+    def show_learning(self, learning: Learning) -> None:
+        """Tell how far the run is, and how well Bob does."""
+        if learning is self._learning:
+            return
+        self._learning = learning
+        rate = "not measured yet" if learning.success is None else f"**{learning.success:.0%}**"
+        steps = f"{learning.num_env_steps:,} of {learning.total_env_steps:,} steps"
+        self._learned.content = f"Learning: {steps}\n\nRandom goals solved: {rate}"
+        self._success.value = 100.0 * (learning.success or 0.0)
+        if learning.goal_map is not None:
+            self._map.image = learning.goal_map
 
     def _tell(self, handle: Any, name: str, value: Any) -> None:
         """Set what the game has changed since it was told; not what a user has, of which the game will hear yet."""

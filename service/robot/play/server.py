@@ -15,6 +15,7 @@ import numpy as np
 from service.base import ports
 from service.base.errors import TandemError, needs_extra
 from service.registry.loading import Trained
+from service.robot.play.following import Following
 from service.robot.play.game import Game
 from service.robot.play.page import LiveScene, Panel
 
@@ -32,22 +33,30 @@ class LiveWorld:
         host: to listen on; others than this machine's own let everybody who reaches it play along.
         port: to listen on; None for 8322, or the next one that is free.
         seed: of the game.
+        following: the run that the players are of, where it goes on.
 
     Raises:
         TandemError: the packages of the extra ``play`` are missing, the port is taken, or the host is not here.
     """
 
-    def __init__(self, players: Trained, host: str = "127.0.0.1", port: int | None = None, seed: int = 0) -> None:
+    def __init__(
+        self,
+        players: Trained,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        seed: int = 0,
+        following: Following | None = None,
+    ) -> None:
         with needs_extra("play", "tandem play"):
             import mjviser  # noqa: F401
             import viser
         self.port = free_port(host, port)
         self.host = host
-        self.game = Game(players, seed)
+        self.game, self._following = Game(players, seed), following
         self._server = _quiet_server(viser, host, self.port)
         try:
             self.scene = LiveScene(self._server, self.game.world)
-            self.panel = Panel(self._server, self.game)
+            self.panel = Panel(self._server, self.game, follows=following is not None)
         except BaseException:
             self.close()
             raise
@@ -84,6 +93,10 @@ class LiveWorld:
             elapsed_s: seconds on the clock since the last tick.
         """
         game, panel = self.game, self.panel
+        if self._following is not None and (learning := self._following.learning) is not None:
+            if learning.players is not None and learning.players is not game.players:
+                game.take(learning.players)
+            panel.show_learning(learning)
         asked = panel.do_what_was_asked()
         dragged = self._take_dragged_goal()
         steps = game.num_steps

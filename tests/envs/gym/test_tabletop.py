@@ -11,7 +11,7 @@ from service.base.errors import TandemError
 from service.config import WorldConfig
 from service.envs.gym.registration import TABLETOP_ID
 from service.envs.gym.tabletop import TabletopEnv
-from service.envs.tasks import EPISODE_STEPS
+from service.envs.task import EPISODE_STEPS, Task
 
 CONFIG = WorldConfig(physics_step_s=0.004, num_substeps=10)
 
@@ -52,10 +52,22 @@ def assert_same(left, right):
 
 def test_made_by_its_name(made):
     assert isinstance(made.unwrapped, TabletopEnv)
-    assert made.spec.max_episode_steps == EPISODE_STEPS == 50
-    direct = gymnasium.make(f"service.envs.gym.registration:{TABLETOP_ID}", goals="air")
-    assert direct.unwrapped.goals == "air"
+    direct = gymnasium.make(f"tandem_skills:{TABLETOP_ID}", task="inair")
+    assert direct.unwrapped.rules.task.goals == "volume"
     direct.close()
+
+
+@pytest.mark.parametrize(("task", "num_steps"), [(None, EPISODE_STEPS), (Task("Short", episode_steps=3), 3)])
+def test_an_episode_is_as_long_as_its_task(task, num_steps):
+    one = gymnasium.make(TABLETOP_ID, config=CONFIG, task=task)
+    many = gymnasium.make_vec(TABLETOP_ID, num_envs=2, config=CONFIG, task=task)
+    one.reset(seed=0)
+    many.reset(seed=0)
+    action = np.zeros(4, dtype=np.float32)
+    ends = [(one.step(action)[3], *many.step(np.stack([action] * 2))[3].tolist()) for _ in range(num_steps)]
+    assert ends == [(False,) * 3] * (num_steps - 1) + [(True,) * 3]
+    one.close()
+    many.close()
 
 
 def test_reward_is_paid_at_every_step_on_target(env):
@@ -163,9 +175,7 @@ def test_bad_actions_are_refused(env, action):
         env.step(action.astype(np.float32))
 
 
-@pytest.mark.parametrize(
-    ("option", "value"), [("goals", "moon"), ("render_mode", "human"), ("success_distance_m", 0.0)]
-)
+@pytest.mark.parametrize(("option", "value"), [("render_mode", "human"), ("success_distance_m", 0.0)])
 def test_bad_options_are_named(option, value):
     with pytest.raises(TandemError, match=rf"{option} = {value!r}") as caught:
         TabletopEnv(CONFIG, **{option: value})

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from service.actors.evaluation import IdlePolicy
 from service.base.errors import TandemError
 from service.envs.observations import layouts
+from service.envs.tasks import find_task
 from service.learner.sac_networks import GaussianActor
 from service.policies.networks import export_parameters
 from service.registry.learned import LearnedPolicy, action_weights, num_inputs
@@ -38,6 +40,19 @@ def test_bob_goes_where_the_goal_is_put_and_stays(game):
     game.set_goal(np.array([9.0, 0.0, -1.0]))
     workspace = game.world.workspace
     assert game.goal.tolist() == [workspace.upper_m[0], 0.0, game.world.rest_height_m]
+
+
+def test_who_misses_the_goal_that_was_put_begins_anew(game):
+    """A Bob who still learns may be stuck; the goal stays, and he tries again."""
+    game.take(dataclasses.replace(game.players, policy=IdlePolicy()))
+    game.set_goal(np.array([0.1, 0.1, 0.2]))
+    start, captions = game.worlds.object_position[0].copy(), set()
+    for _ in range(120):
+        game.step()
+        captions.add(game.caption)
+    assert "Not there in 3.2 s" in captions
+    assert game.goal.tolist() == [0.1, 0.1, 0.2]
+    assert np.linalg.norm(game.worlds.object_position[0] - start) > 0.01  # another start
 
 
 def test_another_goal_comes_when_he_is_there(game):
@@ -134,7 +149,7 @@ def test_a_task_and_its_orchestrator(champion):
         torch.manual_seed(4)
         actor = export_parameters(GaussianActor(num_inputs(seen)[1], num, (8,)))
     policy = Counting(actor, champion.primitives, seen)
-    common = {"task": "wall", "method": "ours", "trained": champion}
+    common = {"task": find_task("wall"), "method": "ours", "trained": champion}
     game = Game(Trained("mine@1", "orchestrator", champion.config, policy, actor, **common), seed=0)
     begun.clear()
     game.reset()

@@ -1,0 +1,131 @@
+"""A task applied to worlds that are played: its goals, what is reached and paid, and what is remembered."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.base.types import Array, BoolArray, StateArray
+from service.base.user_code import CodeError, checked, naming_errors_of, place_of
+from service.config.run import SUCCESS_DISTANCE_M
+from service.envs.batch import WorldBatch
+from service.envs.sampling import GoalKind, check_goals, draw_goals, inside_fixtures, inside_obstacles
+from service.envs.task import Bodies, Task, View
+
+_MAX_DRAWS = 1000
+_ALL = slice(None)
+
+
+def _shown(array: Array) -> Array:
+    """The same, not to be written to: what a user's function changed in it would change the worlds."""
+    seen = array.view()
+    seen.flags.writeable = False
+    return seen
+
+
+class Rules:
+    """What a task says of N worlds.
+
+    Args:
+        task: its functions may be run; or a kind of random goals, where nothing else is asked.
+        worlds: N of them, of the task's world.
+        success_distance_m: greatest distance to the goal that counts as reached, where the task does not say.
+
+    Raises:
+        TandemError: its functions may not be run, or goals that the world cannot have.
+    """
+
+    def __init__(
+        self, task: Task | GoalKind, worlds: WorldBatch, success_distance_m: float = SUCCESS_DISTANCE_M
+    ) -> None:
+        self.task = Task("Goals", goals=task) if isinstance(task, str) else task
+        if self.task.closed:
+            raise CodeError(self.task.closed)
+        if isinstance(self.task.goals, str):
+            check_goals(self.task.goals, worlds.config)
+        self._worlds, self._near_m = worlds, success_distance_m
+        self.elapsed: NDArray[np.int64] = np.zeros(worlds.num_worlds, dtype=np.int64)
+        """(N,) steps of the episode so far."""
+        self.memory: StateArray = np.zeros((worlds.num_worlds, self.task.memory_size))
+        """(N, M)"""
+
+    def view(self, goal: StateArray) -> View:
+        """What its functions see now, for (N, 3) goals, metres."""
+        worlds, layout = self._worlds, self._worlds.layout
+        objects = worlds.object_position[:, None], worlds.states[:, None, layout["object_velocity"]]
+        fingers = worlds.robot.openings(worlds.states[:, layout["fingers"]]).sum(axis=1)
+        parts = worlds.ee_position, fingers, worlds.contacts()[:, None], goal[:, None], self.elapsed, self.memory
+        return View(Bodies(*map(_shown, objects)), *map(_shown, parts))
+
+    def begin(self, worlds: BoolArray) -> None:
+        """Begin new episodes in some worlds (N,)."""
+        self.elapsed[worlds], self.memory[worlds] = 0, 0.0
+
+    def draw(self, rng: np.random.Generator, worlds: slice = _ALL) -> StateArray:
+        """(N, 3) goals for some worlds, metres.
+
+        Those of a function are drawn again where they are out of reach, or inside something.
+
+        Raises:
+            CodeError: the function gives something else, or no goal that is within reach and clear.
+        """
+        config, goals = self._worlds.config, self.task.goals
+        places = self._worlds.places.of(worlds)
+        if isinstance(goals, str):
+            return draw_goals(goals, rng, config, self._near_m, places)
+        view = self.view(self._worlds.object_position).of(worlds)
+        goal, wrong = np.empty_like(places.object), np.ones(len(places.object), dtype=bool)
+        for _ in range(_MAX_DRAWS):
+            asked = view.of(wrong)
+            goal[wrong] = self._asked("goals", asked.objects.place.shape, asked, rng)[:, 0]
+            wrong = self.out_of_reach(goal) | inside_fixtures(goal, config)
+            wrong |= inside_obstacles(goal, places.obstacles, config)
+            if not wrong.any():
+                return goal
+        raise CodeError(f"{place_of(goals)[1]}: goals gave no place that is within reach and clear: choose others")
+
+    def advance(self, goal: StateArray) -> None:
+        """Count a step that was made, and update the memory."""
+        self.elapsed += 1
+        if self.task.remember is not None:
+            self.memory = self._asked("remember", self.memory.shape, self.view(goal))
+
+    def solved(self, goal: StateArray) -> BoolArray:
+        """(N,) whether the worlds are as the task asks, for (N, 3) goals, metres."""
+        return self.success(self.view(goal))
+
+    def success(self, view: View) -> BoolArray:
+        """(N,) whether the task's function says so; without one, whether the object is near its goal."""
+        if self.task.success is None:
+            near: BoolArray = np.linalg.norm(view.objects.place[:, 0] - view.goal[:, 0], axis=1) <= self._near_m
+            return near
+        found: BoolArray = self._asked("success", view.objects.place.shape[:1], view, truth=True)
+        return found
+
+    def reward(self, view: View) -> NDArray[np.float64]:
+        """(N,) what the task's function pays for a step that led to ``view``; without one, 1 for success, else 0."""
+        if self.task.reward is None:
+            return self.success(view).astype(np.float64)
+        paid: StateArray = self._asked("reward", view.objects.place.shape[:1], view)
+        return paid
+
+    def nearest(self, goal: StateArray) -> StateArray:
+        """(N, 3) where the object can be brought, nearest to (N, 3); on the table it may be lower than the arm."""
+        raised = np.maximum(goal, [-np.inf, -np.inf, self._worlds.config.rest_height_m])
+        reached = self._worlds.reach.clip(raised)
+        reached[:, 2] = np.minimum(raised[:, 2], self._worlds.reach.height[-1])
+        return reached
+
+    def out_of_reach(self, goal: StateArray) -> BoolArray:
+        """(N,) whether the arm brings nothing as near to (N, 3) goals as counts."""
+        near: BoolArray = np.linalg.norm(self.nearest(goal) - goal, axis=1) <= self._near_m
+        return ~near  # what is no number is out of reach, too
+
+    def _asked(self, name: str, shape: tuple[int, ...], *given: Any, truth: bool = False) -> Array:
+        function = getattr(self.task, name)
+        origin, place = place_of(function)
+        with naming_errors_of(origin):
+            found = np.asarray(function(*given))
+        return checked(f"{place}: {name}", found, shape, truth=truth)

@@ -1,0 +1,204 @@
+"""A task: what it changes in the world, where its goals are, what counts as success, and what is paid.
+
+A task is data, and up to four functions over a ``View`` of N worlds: ``goals``, ``success``, ``reward`` and
+``remember``. ``service.envs.rules`` applies one to worlds that are played.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.base.types import Array, BoolArray, FloatArray, StateArray
+from service.base.user_code import CodeError
+
+if TYPE_CHECKING:
+    from service.config import WorldConfig
+    from service.envs.sampling import GoalKind
+
+
+EPISODE_STEPS = 50
+"""Of a task that does not say (paper: 50)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bodies:
+    """Objects of N worlds; ``bodies[:, k]`` are those of one place in each."""
+
+    place: StateArray
+    """(N, K, 3) centres, metres."""
+    velocity: StateArray
+    """(N, K, 3) m/s."""
+
+    def __getitem__(self, key: Any) -> Bodies:
+        """Some of them."""
+        known = not isinstance(self.velocity, _NotGiven)
+        return Bodies(self.place[key], self.velocity[key] if known else self.velocity)
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What the functions of a task see of N worlds, after a step."""
+
+    objects: Bodies
+    """Place and velocity of the K objects, (N, K, 3) each."""
+    gripper: StateArray
+    """(N, 3) point between the fingertips, metres."""
+    fingers: StateArray
+    """(N,) distance of the fingertips, metres."""
+    contacts: BoolArray
+    """(N, K, 2) whether the left and the right finger touched the object during the last step."""
+    goal: StateArray
+    """(N, K, 3) metres; of ``goals``, the places of the objects."""
+    elapsed: NDArray[np.int64]
+    """(N,) steps since the episode began."""
+    memory: StateArray
+    """(N, M) what ``remember`` gave last; 0 when an episode begins."""
+
+    def of(self, worlds: BoolArray | slice) -> View:
+        """The same of some worlds."""
+        return View(*(getattr(self, each.name)[worlds] for each in fields(self)))
+
+    def rows(self) -> FloatArray:
+        """(N, V) its numbers without goal and memory, to be kept in a replay buffer; ``of_rows`` reads them."""
+        parts = self.objects.place, self.objects.velocity, self.gripper, self.fingers, self.contacts, self.elapsed
+        rows: FloatArray = np.concatenate(
+            [each.reshape(len(self.elapsed), -1) for each in parts], axis=1, dtype=np.float32
+        )
+        return rows
+
+    @classmethod
+    def of_rows(cls, rows: FloatArray, goal: FloatArray) -> View:
+        """The view that (N, V) rows were, with (N, K, 3) goals and without memory."""
+        num, many = goal.shape[:2]
+        place, velocity, gripper, fingers, contacts, elapsed = np.split(
+            rows.astype(np.float64), np.cumsum([3 * many, 3 * many, 3, 1, 2 * many]), axis=1
+        )
+        objects = Bodies(place.reshape(goal.shape), velocity.reshape(goal.shape))
+        touched = contacts.reshape(num, many, 2) > 0
+        wanted, steps = goal.astype(np.float64), elapsed[:, 0].astype(np.int64)
+        return cls(objects, gripper, fingers[:, 0], touched, wanted, steps, cast("Any", _NotGiven("memory")))
+
+
+def num_in_rows(num_objects: int) -> int:
+    """V of ``View.rows``."""
+    return 8 * num_objects + 5
+
+
+Function = Callable[[View], Any]
+"""Of a view of N worlds to an array with a row for each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What is asked for in a world, which differs from the one that primitives were trained in.
+
+    Functions get a ``View`` of N worlds and give an array with a row for each; any NumPy will do.
+
+    Raises:
+        ValueError: a number out of range, or a memory without ``remember``, or the other way round.
+    """
+
+    title: str
+    """A word or two; of ours, the name in the paper."""
+    description: str = ""
+    """A few words on what it asks for."""
+    goals: GoalKind | Callable[[View, np.random.Generator], Any] = "mixed"
+    """Where random goals are: ``table``, ``air``, ``volume`` or ``mixed``; or a function of the view at the start and
+    of random numbers to (N, K, 3), metres."""
+    world: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of a world that are replaced."""
+    success: Function | None = None
+    """(N,) bool; None: the object is within 5 cm of its goal. What counts is the last step of an episode."""
+    reward: Function | None = None
+    """(N,) float that is paid in each step; None: 1 where ``success`` is true, else 0."""
+    remember: Function | None = None
+    """(N, M) float, the memory from the next step on, such as the number of steps that something was so."""
+    memory_size: int = 0
+    """M."""
+    episode_steps: int = EPISODE_STEPS
+    """Steps of an episode, 40 ms each."""
+    version: int = 1  # 0: other contacts (docs/decisions/0010), and Box with another rule of success (0007)
+    """Version in its Gymnasium name; results of different ones are not compared."""
+    name: str = ""
+    """By which commands know it; ``find_task`` says it."""
+    code: Mapping[str, str] = field(default_factory=dict)
+    """Text of the file that it is from, if that is not ours; ``find_task`` says it."""
+    closed: str = ""
+    """Why its functions may not be run; then they are None."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.world, Mapping):
+            raise ValueError(f"task {self.title}: world = {self.world!r}: give a mapping of settings")
+        if self.episode_steps < 1 or self.memory_size < 0:
+            raise ValueError(
+                f"task {self.title}: episode_steps = {self.episode_steps}, memory_size = {self.memory_size}: "
+                "give at least 1, and at least 0"
+            )
+        if (self.remember is None) != (self.memory_size == 0) and not self.closed:
+            raise ValueError(
+                f"task {self.title}: remember gives the memory, and memory_size says how many numbers: give both, or "
+                "none of them"
+            )
+
+    @property
+    def id(self) -> str:
+        """Gymnasium name, such as ``tandem/InAir-v1``."""
+        return f"tandem/{self.title}-v{self.version}"
+
+    @property
+    def is_own(self) -> bool:
+        """Whether success or reward are the user's."""
+        return self.success is not None or self.reward is not None
+
+    @property
+    def goal_kind(self) -> GoalKind:
+        """Random goals of ours that come nearest: where no function is asked."""
+        return self.goals if isinstance(self.goals, str) else "mixed"
+
+    def world_from(self, world: WorldConfig) -> WorldConfig:
+        """The world of this task, for primitives that were trained in ``world``."""
+        from pydantic import ValidationError
+
+        from service.config.frozen import first_error
+
+        tree = world.model_dump()
+        for key, value in self.world.items():
+            old = tree.get(key)  # a name, or a description, which another one replaces
+            if isinstance(value, Mapping) and isinstance(old, dict) and "shape" not in value:
+                value = {**old, **value}
+            tree[key] = value
+        try:
+            return type(world).model_validate(tree)
+        except ValidationError as error:
+            raise CodeError(f"task {self.name or self.title}: world.{first_error(error)}") from None
+
+    def data(self) -> dict[str, Any]:
+        """What a manifest keeps of a user's task: enough to act, without its functions."""
+        from pydantic_core import to_jsonable_python
+
+        kept = {key: getattr(self, key) for key in ("title", "description", "episode_steps", "version", "name")}
+        return {**kept, "world": to_jsonable_python(dict(self.world), fallback=float), "goals": self.goal_kind}
+
+
+class _NotGiven:
+    """Stands for a part of a view that is not known."""
+
+    __array_ufunc__ = None
+
+    def __init__(self, part: str) -> None:
+        self._part = part
+
+    def __getitem__(self, key: Any) -> Any:
+        raise LookupError(f"{self._part} is not known here")
+
+
+def view_of_places(achieved: Array, desired: Array) -> View:
+    """A view of (N, 3) places of the object and (N, 3) goals, which knows nothing else."""
+    names = ("velocity", "gripper", "fingers", "contacts", "elapsed", "memory")
+    velocity, gripper, fingers, contacts, *others = (cast("Any", _NotGiven(name)) for name in names)
+    return View(Bodies(achieved[:, None], velocity), gripper, fingers, contacts, desired[:, None], *others)

@@ -1,0 +1,113 @@
+"""Goals of a user's own source, which Bob plays besides those that Alice has just proposed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from inspect import getfile
+
+import numpy as np
+
+from service.base.errors import ConfigError
+from service.base.types import Array, BoolArray, StateArray
+from service.base.user_code import CodeError, checked, find_class, naming_errors_of
+from service.config import WorldConfig
+from service.config.self_play import SelfPlayConfig
+from service.envs.sampling import GoalKind, sample_goals
+from service.generator.validity import in_workspace
+
+NUM_DRAWN = 1024
+"""Goals drawn in a round when they do not come from Alice; of these, those that are played are chosen."""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What the task generator knows, for a source of goals."""
+
+    world: WorldConfig
+    success_distance_m: float
+    coverage: float
+    """Share of the workspace's cells in which a goal was ever proposed."""
+    success_rate: float
+    """Bob's, mean over all cells; 0 where no goal was proposed."""
+    near: Callable[[StateArray], BoolArray]
+    """Whether (M, 3) goals are in cells to which an object was brought in a game, or beside one: (M,)."""
+
+    def random(self, rng: np.random.Generator, num: int = NUM_DRAWN, kind: GoalKind = "mixed") -> StateArray:
+        """(num, 3) goals as those of an evaluation, metres."""
+        return sample_goals(kind, rng, num, self.world, self.success_distance_m)
+
+
+class GoalSource:
+    """Goals that Bob plays besides those that Alice has just proposed: a base for a user's own.
+
+    It is a function of what is known, so a resumed run goes on with the same goals. Each is tried from where worlds are
+    now and, with ``generator.replay_from_reset``, from starts of games.
+    """
+
+    def goals(self, known: Known, rng: np.random.Generator) -> Array:
+        """(M, K, 3) goals of all objects, metres; those outside the workspace are left out."""
+        raise NotImplementedError
+
+    def weights(self, known: Known, goal: StateArray, start: StateArray, learnability: StateArray) -> Array:
+        """(M,) how often each task is drawn, not below 0: by p (1 - p) of Bob's success in tasks like it, (M,).
+
+        Goals and starts are (M, K, 3) places of all objects, metres.
+        """
+        return learnability + 0.01
+
+
+class CheckedSource:
+    """A user's source, whose answers are checked; for ``coverage`` and others see ``Known``."""
+
+    def __init__(
+        self, config: SelfPlayConfig, coverage: float, success_rate: float, near: Callable[[StateArray], BoolArray]
+    ) -> None:
+        kind: type[GoalSource] = find_class(config.generator.goal_source, config.code, GoalSource)
+        self._known = Known(config.world, config.success_distance_m, coverage, success_rate, near)
+        self._origin, self._name = getfile(kind), kind.__name__
+        with naming_errors_of(self._origin):
+            self._source = kind()
+
+    def goals(self, rng: np.random.Generator) -> StateArray:
+        """(M, 3) goals in the workspace, metres."""
+        with naming_errors_of(self._origin):
+            goal = np.asarray(self._source.goals(self._known, rng))
+        goal = checked(f"{self._origin}: {self._name}.goals", goal, (len(np.atleast_1d(goal)), 1, 3))
+        inside = in_workspace(goal[:, 0], self._known.world.workspace)
+        kept: StateArray = goal[inside, 0]
+        return kept
+
+    def weights(self, goal: StateArray, start: StateArray, learnability: StateArray) -> StateArray:
+        """(M,) weights of tasks with (M, 3) goals and starts."""
+        if not len(goal):
+            return np.zeros(0)
+        with naming_errors_of(self._origin):
+            weight = np.asarray(self._source.weights(self._known, goal[:, None], start[:, None], learnability))
+        where = f"{self._origin}: {self._name}.weights"
+        weight = checked(where, weight, learnability.shape)
+        if (weight < 0.0).any():
+            raise CodeError(f"{where} gave numbers below 0; give others")
+        return weight
+
+
+def check_source(config: SelfPlayConfig) -> None:
+    """Try a user's source before anything is known.
+
+    Raises:
+        ConfigError: it does not run, gives something else, or no goal in the workspace.
+    """
+    rng = np.random.default_rng(0)
+    for near in (False, True):
+        source = CheckedSource(config, 0.0, 0.0, partial(_all, near))
+        goal = source.goals(rng)
+        source.weights(goal, np.zeros_like(goal), np.full(len(goal), 0.25))
+    if not len(goal):
+        raise ConfigError(
+            f"generator.goal_source = {config.generator.goal_source!r}: no goal of it is in the workspace"
+        )
+
+
+def _all(near: bool, goal: StateArray) -> BoolArray:
+    return np.full(len(goal), near)

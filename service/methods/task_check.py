@@ -1,0 +1,83 @@
+"""Tries a task of a user's before anything is learned: its functions run, and success comes and goes."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from service.base.errors import ConfigError
+from service.base.types import BoolArray
+from service.base.user_code import CodeError, place_of
+from service.config import WorldConfig
+from service.envs.batch import WorldBatch
+from service.envs.observations import ACTION
+from service.envs.rules import Rules
+from service.envs.task import Task, View
+
+_NUM_WORLDS = 64
+_logger = logging.getLogger(__name__)
+
+
+def check_task(task: Task, world: WorldConfig, *, relabels: bool = False) -> None:
+    """Play an episode of a user's task at random, and one in which the object is brought to its goal by hand.
+
+    A success that neither comes to is warned of: it may need more than that, or be impossible.
+
+    Args:
+        task: of a user's; one of ours is not tried.
+        world: that it is learned in, of which the task replaces its part.
+        relabels: whether it is asked what would have been paid for other goals, which no memory tells.
+
+    Raises:
+        TandemError: a function raises, or gives another shape, type or NaN; goals that the world cannot have;
+            or, with ``relabels``, pay by memory.
+    """
+    if not task.code:
+        return
+    rng = np.random.default_rng(0)
+    world = task.world_from(world)
+    with WorldBatch(world, _NUM_WORLDS, num_threads=1) as worlds:
+        rules = Rules(task, worlds)
+        worlds.reset(rng)
+        goal = rules.draw(rng)
+        start = worlds.states.copy()
+
+        def solved() -> BoolArray:
+            rules.reward(rules.view(goal))
+            return rules.solved(goal)
+
+        if relabels and task.is_own:  # without the memory
+            try:
+                rules.reward(View.of_rows(rules.view(goal).rows(), goal[:, None].astype(np.float32)))
+            except CodeError as error:
+                raise ConfigError(
+                    f"{error}: hindsight asks what would have been paid for other goals. Give a reward that does "
+                    "without memory, or take a method without hindsight, such as ours"
+                ) from None
+        at_start, at_random, by_hand = solved(), np.zeros(_NUM_WORLDS, bool), np.zeros(_NUM_WORLDS, bool)
+        for _ in range(task.episode_steps):
+            worlds.step(rng.uniform(-1.0, 1.0, (_NUM_WORLDS, ACTION.size)).astype(np.float32))
+            rules.advance(goal)
+            at_random |= solved()
+        rules.begin(np.ones(_NUM_WORLDS, dtype=bool))
+        place, way = worlds.layout["object"], goal - start[:, worlds.layout["object"]]
+        for step in range(task.episode_steps):  # there in half of the time, then it stays
+            moved = start.copy()
+            moved[:, place] += way * min(1.0, (step + 1) / max(1, task.episode_steps // 2))
+            worlds.restore(moved)
+            rules.advance(goal)
+            by_hand |= solved()
+    where = task.name if task.success is None else place_of(task.success)[1]
+    if at_start.all():
+        _logger.warning("%s: success is true at the start of every episode; is that meant?", where)
+    _logger.info(
+        "%s: success at the start of %.0f %% of episodes, in %.0f %% of random ones, in %.0f %% where the object goes "
+        "straight to its goal",
+        where, 100 * at_start.mean(), 100 * at_random.mean(), 100 * by_hand.mean(),
+    )  # fmt: skip
+    if not (at_random | by_hand).any():
+        _logger.warning(
+            "%s: success in 0 %% of %d random episodes, and in 0 %% where the object goes straight to its goal: look "
+            "whether it can be reached", where, _NUM_WORLDS,
+        )  # fmt: skip

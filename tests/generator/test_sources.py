@@ -1,0 +1,73 @@
+"""A user's source of goals: what it is told, what becomes of its goals, and what is refused."""
+
+import numpy as np
+import pytest
+
+from service.base.errors import TandemError
+from service.config import load_config
+from service.generator.generator import TaskGenerator
+from service.generator.validity import Verdict
+from tests.generator.test_generator import FREE, ONE_GAME, choose, everywhere, only_starts, record
+from tests.runs.runs import assert_one_line
+
+CODE = """
+import numpy as np
+from service.generator.sources import GoalSource
+
+class Corner(GoalSource):
+    def goals(self, known, rng):
+        goal = rng.uniform([0.05, 0.05, 0.025], [0.3, 0.1, 0.025], (400, 1, 3))
+        return goal[known.near(goal[:, 0])]
+
+    def weights(self, known, goal, start, learnability):
+        assert goal.shape == start.shape == (*learnability.shape, 1, 3)
+        return (goal[:, 0, 0] > 0.08) * (learnability > 0.0)
+"""
+SETTINGS = ("generator.goal_source=corner.py", "generator.replay_invalid=true", "generator.replay_from_reset=true")
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "corner.py").write_text(CODE)
+    return tmp_path / "corner.py"
+
+
+def test_goals_are_its_own_and_in_the_workspace(file):
+    config = load_config(None, SETTINGS).begin("registry", None)
+    assert config.code == {"corner.py": CODE}
+    file.unlink()
+    generator = TaskGenerator(config, FREE)
+    outside = [Verdict.OUTSIDE] * 200
+    assert not choose(generator, outside).replayed.any()  # nothing was reached yet, so it has none
+    everywhere(only_starts(ONE_GAME), generator)
+    choice = choose(generator, outside)
+    assert choice.replayed.all()
+    assert 0.3 < choice.from_reset.mean() < 0.7
+    x, y, z = choice.goal.T
+    assert 0.08 < x.min() < x.max() <= 0.125  # where weights are, and no further than the workspace
+    assert 0.05 <= y.min() < y.max() <= 0.1
+    assert (z == 0.025).all()
+    same = choose(generator, outside)
+    np.testing.assert_array_equal(choice.goal, same.goal)
+    record(generator, only_starts(ONE_GAME))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("return goal[known", "return goal[:, 0][known", "corner.py: Corner.goals gave float64 of shape ("),
+        ("[0.05, 0.05, 0.025], [0.3", "[1.05, 0.05, 0.025], [1.3", "no goal of it is in the workspace"),
+        ("known.near(", "known.far(", "corner.py:8: AttributeError: "),
+        ("(learnability > 0.0)", "np.nan", "Corner.weights gave a number that is not finite"),
+        ("(learnability > 0.0)", "-learnability", "Corner.weights gave numbers below 0"),
+        ("(learnability > 0.0)", "learnability[:, None]", "Corner.weights gave float64 of shape ("),
+        ("Corner(GoalSource)", "Corner", "corner.py: it has to define one class that derives from GoalSource, and has"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_is_learned(file, old, new, said):
+    assert old in CODE
+    file.write_text(CODE.replace(old, new))
+    with pytest.raises(TandemError) as error:
+        load_config(None, SETTINGS).begin("registry", None)
+    assert_one_line(error.value, said)

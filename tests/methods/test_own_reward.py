@@ -1,0 +1,113 @@
+"""An intrinsic reward from a user's file: trained, killed, resumed, published, and loaded without its code."""
+
+import numpy as np
+import pytest
+
+from service.base.errors import TandemError
+from service.config import load_config
+from service.registry.loading import load
+from service.registry.publishing import publish
+from service.registry.registry import Registry
+from service.runs.resuming import resumed_config
+from service.runs.train import train
+from service.store.run_directory import RunDirectory
+from tests.runs.runs import KilledError, assert_one_line, assert_same_run
+
+pytestmark = pytest.mark.usefixtures("default_signals")
+CODE = """
+from service.methods.intrinsic_reward import IntrinsicReward
+
+class Upwards(IntrinsicReward):
+    prior = "sphere"
+    zero_shot = "none"
+    pays_features = True
+
+    def loss(self, before, after, skill):
+        return -(self.paid(before, after, skill) * skill).sum(dim=1).mean() + self.network(after).square().mean()
+
+    def paid(self, before, after, skill):
+        return self.network(after) - self.network(before)
+"""
+NESTED = """
+    def make_network(self):
+        from torch import nn
+        return nn.Sequential(nn.Linear(3, 8), nn.Tanh(), nn.Linear(8, self.config.size))
+
+    def loss"""
+FORGETS = """
+    scale = 1.0
+
+    def learn(self, before, after, skill):
+        self.scale += 1.0
+        return self.scale * super().learn(before, after, skill)
+
+    def loss"""
+SMALL = (
+    "method=skills", "skills.method=upwards.py:Upwards", "skills.size=3", "skills.episode_steps=5",
+    "skills.hidden_sizes=[8]", "skills.batch_size=8", "skills.sac.num_worlds=4", "skills.sac.gradient_steps=1",
+    "skills.sac.batch_size=16", "skills.sac.learning_starts=20", "skills.sac.hidden_sizes=[8]",
+    "run.total_env_steps=120", "run.checkpoint_interval=2", "run.evaluation_interval=0", "run.num_threads=1", "name=up",
+)  # fmt: skip
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "upwards.py").write_text(CODE)
+    return tmp_path / "upwards.py"
+
+
+def test_it_goes_the_way_of_ours(file, tmp_path):
+    def kill(metrics):
+        if metrics["iteration"] == 5:
+            raise KilledError
+
+    registry = tmp_path / "registry"
+    config = load_config(None, SMALL).begin(registry, None)
+    assert (config.skills.prior, config.skills.zero_shot, config.code) == ("sphere", "none", {"upwards.py": CODE})
+    train(config, RunDirectory(tmp_path / "whole"), registry, publish=False, on_iteration=lambda _: None)
+    with pytest.raises(KilledError):
+        train(config, RunDirectory(tmp_path / "cut"), registry, publish=False, on_iteration=kill)
+    file.unlink()
+    directory = RunDirectory(tmp_path / "cut")
+    train(resumed_config(directory, []), directory, registry, resume=True, publish=False, on_iteration=lambda _: None)
+    assert_same_run(tmp_path / "whole", tmp_path / "cut")
+    found = load(str(tmp_path / "whole"), registry)
+    version = publish(Registry(registry), config, found.parameters, {})
+    skills = load(str(version), registry).skills
+    drawn = skills.draw(50, np.random.default_rng(0))
+    np.testing.assert_allclose(np.linalg.norm(drawn, axis=1), 1.0, rtol=1e-5)
+    with pytest.raises(TandemError, match=r"skills of upwards.py:Upwards lead to no goal"):
+        skills.towards(np.zeros((1, 11), np.float32), np.zeros((1, 3), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("dim=1).mean()", "dim=7).mean()", "upwards.py:10: IndexError: "),
+        ("pays_features = True", "pays_features = False", "Upwards.paid gave float32 of shape (8, 3); give float"),
+        ("- self.network(before)", "/ 0.0", "Upwards.paid gave a number that is not finite"),
+        ("class Upwards(IntrinsicReward)", "class Upwards", "upwards.py:Upwards: no class that derives from Intrin"),
+        ("IntrinsicReward\n\nclass", "Gone\n\nclass", "upwards.py:2: ImportError: "),
+        ("    def loss", NESTED, "Upwards.make_network: only torch.nn.Linear with torch.nn.ReLU between them can be"),
+        ("    def loss", FORGETS, "Upwards: goes on otherwise after load_state(state()): tensors() has to have all"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said_before_anything_is_learned(file, tmp_path, old, new, said):
+    assert old in CODE
+    file.write_text(CODE.replace(old, new))
+    with pytest.raises(TandemError) as error:
+        load_config(None, SMALL).begin(tmp_path, None)
+    assert_one_line(error.value, said)
+
+
+def test_a_prior_of_ours_is_not_chosen(file):
+    with pytest.raises(TandemError) as error:
+        load_config(None, ["method=skills", "skills.method=lsd", "skills.prior=uniform"])
+    assert_one_line(error.value, "prior of lsd is normal, not 'uniform': leave it out")
+
+
+def test_a_method_that_there_is_not(file):
+    with pytest.raises(TandemError) as error:
+        load_config(None, ["method=skills", "skills.method=metrra"])
+    assert_one_line(error.value, "skills.method 'metrra': choose one of lsd, diayn, dads, metra, csf, or FILE.py:CLASS")
