@@ -63,12 +63,12 @@ class Row:
 
 _PRETRAIN = "pretrain --run-dir {run} --registry {registry} --no-publish --quiet --set seed=3 --set run.num_threads=1"
 _SELF_PLAY = (
-    f"{_PRETRAIN} --set run.total_env_steps=8000 --set run.checkpoint_interval=12 --set run.evaluation_interval=8"
+    f"{_PRETRAIN} --set run.total_env_steps=20000 --set run.checkpoint_interval=12 --set run.evaluation_interval=8"
     " --set run.evaluation_episodes=20 --set game.num_worlds=24 --set game.bob_margin_after_updates=6"
     " --set game.blocked_gripper_min_success=0 --set generator.opponent_interval=2"
     " --set learner.alice.minibatch_size=256"
 )
-_RAY = f"{_SELF_PLAY} --set run.total_env_steps=8600 --runtime ray --num-actors 1 --status off"
+_RAY = f"{_SELF_PLAY} --set run.total_env_steps=20600 --runtime ray --num-actors 1 --status off"
 _ROBUST = (
     f"{_PRETRAIN} --config panda-cube-robust --from panda-cube@champion --set run.total_env_steps=6000"
     " --set run.evaluation_interval=3 --set run.evaluation_episodes=20 --set distillation.num_worlds=24"

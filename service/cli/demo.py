@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 SOLVED, TIMES = 0.8, 2
 """It ends once so many of 100 random goals were solved so often in a row."""
 _SUCCESS = "evaluation/mixed_success_last"
-_BEHIND = 5
-"""Niceness of the viewer: what learns comes first."""
 
 
 class Until:
@@ -127,8 +125,8 @@ def _watched(path: Path, *, wanted: bool) -> Iterator[Callable[[], str]]:
 
             port = free_port("127.0.0.1", PORT)
             command = ["play", str(path), "--registry", str(path / "registry"), "--port", str(port)]
-            process = subprocess.Popen(
-                ["nice", "-n", str(_BEHIND), sys.executable, "-m", "service", *command], start_new_session=True,
+            process = subprocess.Popen(  # a nice one: what learns comes first
+                ["nice", "-n", "5", sys.executable, "-m", "service", *command], start_new_session=True,
                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
                 env={**os.environ, PARENT: str(os.getpid())},
             )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -39,22 +40,19 @@ class Known:
         return sample_goals(kind, rng, num, self.world, self.success_distance_m)
 
 
-class GoalSource:
+class GoalSource(ABC):
     """Goals that Bob plays besides those that Alice has just proposed: a base for a user's own.
 
     It is a function of what is known, so a resumed run goes on with the same goals. Each is tried from where worlds are
     now and, with ``generator.replay_from_reset``, from starts of games.
     """
 
+    @abstractmethod
     def goals(self, known: Known, rng: np.random.Generator) -> Array:
         """(M, K, 3) goals of all objects, metres; those outside the workspace are left out."""
-        raise NotImplementedError
 
     def weights(self, known: Known, goal: StateArray, start: StateArray, learnability: StateArray) -> Array:
-        """(M,) how often each task is drawn, not below 0: by p (1 - p) of Bob's success in tasks like it, (M,).
-
-        Goals and starts are (M, K, 3) places of all objects, metres.
-        """
+        """(M,) how often to draw tasks by (M, K, 3) goals and starts, and p (1 - p) of Bob's success in such tasks."""
         return learnability + 0.01
 
 

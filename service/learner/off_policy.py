@@ -112,12 +112,15 @@ class TabletopWorlds(ABC):
         """Copy everything that ``load_state`` needs: arrays by name, and random numbers as plain values."""
         worlds = asdict(self.env.state())
         random = worlds.pop("random")
+        if not worlds["memory"].size:
+            del worlds["memory"]  # most tasks keep none
         return {**worlds, "previous": self.previous.copy()}, random
 
     def load_state(self, arrays: dict[str, Array], random: Any) -> None:
         """Go back to a saved state; continues bit-identically."""
         worlds: dict[str, Any] = {name: np.array(array) for name, array in arrays.items()}
         self.previous = worlds.pop("previous")
+        worlds.setdefault("memory", np.zeros((self.num_worlds, 0)))
         self._see(self.env.restore(EnvState(**worlds, random=tuple(random))))
 
     def close(self) -> None:

@@ -62,6 +62,7 @@ def test_goals_are_its_own_and_in_the_workspace(file):
         ("(learnability > 0.0)", "np.nan", "Corner.weights gave a number that is not finite"),
         ("(learnability > 0.0)", "-learnability", "Corner.weights gave numbers below 0"),
         ("(learnability > 0.0)", "learnability[:, None]", "Corner.weights gave float64 of shape ("),
+        ("def goals", "def gaols", "corner.py: TypeError: Can't instantiate abstract class Corner"),
         ("Corner(GoalSource)", "Corner", "corner.py: it has to define one class that derives from GoalSource, and has"),
     ],
 )
