@@ -102,6 +102,25 @@ def test_help_is_light_and_names_every_verb():
     assert [verb for verb in VERBS if not re.search(rf"\b{verb}\b", text)] == []
 
 
+THREADS = """
+import os, sys
+
+class Watch:
+    def find_spec(self, name, path=None, target=None):
+        if name == "numpy":
+            print(os.environ.get("OPENBLAS_NUM_THREADS"), os.environ.get("OMP_NUM_THREADS"))
+
+for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.pop(name, None)
+sys.meta_path.insert(0, Watch())
+import service.cli.main, numpy
+"""
+
+
+def test_commands_ask_for_one_thread_before_numpy_is_imported():
+    assert run_python(THREADS).split() == ["1", "1"]
+
+
 def test_acting_needs_no_torch():
     rooms = [modules_in(room) for room in ROOMS_WITHOUT_TORCH]
     assert all(rooms)

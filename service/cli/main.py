@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import sys
 from typing import Annotated
 
@@ -83,10 +82,6 @@ class _Log(logging.Handler):
 def main() -> None:
     """Entry point of ``tandem`` and ``python -m service``."""
     stop_with_parent()
-    # NumPy's and torch's own threads only get in each other's way: worlds are stepped by MuJoCo's threads. Both read
-    # these variables when they are first imported, which is after this line.
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[_Log()])
     for name in ("OpenGL", "torch"):  # they say at INFO what they do without, and what their caches held
         logging.getLogger(name).setLevel(logging.WARNING)
