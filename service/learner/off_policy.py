@@ -171,20 +171,23 @@ class OffPolicyLoop:
         Returns:
             Means over the updates; none before learning begins.
         """
+        from service.learner.sac import wide_products
+
         config, found = self.learner.config, list[Metrics]()
         until = self.num_env_steps + num_env_steps
-        while self.num_env_steps < until:
-            inputs = self.worlds.inputs()
-            if self.num_env_steps < config.learning_starts:
-                actions = actions_at_random((len(inputs), self.learner.num_actions), self._rng)
-            else:
-                actions = self.learner.act(inputs)
-            self.replay.add(*self.worlds.step(actions))
-            if self.num_env_steps > config.learning_starts:
-                size = config.gradient_steps * config.batch_size
-                found.append(self.learner.update(self.make_batch(self.replay, size, self._rng)))
-                self.num_updates += config.gradient_steps
-            on_steps(self.replay.num_worlds * self.worlds.steps_per_action)
+        with wide_products():
+            while self.num_env_steps < until:
+                inputs = self.worlds.inputs()
+                if self.num_env_steps < config.learning_starts:
+                    actions = actions_at_random((len(inputs), self.learner.num_actions), self._rng)
+                else:
+                    actions = self.learner.act(inputs)
+                self.replay.add(*self.worlds.step(actions))
+                if self.num_env_steps > config.learning_starts:
+                    size = config.gradient_steps * config.batch_size
+                    found.append(self.learner.update(self.make_batch(self.replay, size, self._rng)))
+                    self.num_updates += config.gradient_steps
+                on_steps(self.replay.num_worlds * self.worlds.steps_per_action)
         if found:
             self.learner.average_actor()
         return {name: float(np.mean([each[name] for each in found])) for name in (found[0] if found else ())}

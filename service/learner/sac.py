@@ -7,7 +7,8 @@ beyond its transition. The actor that is evaluated and exported is an average of
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +37,24 @@ class Batch(NamedTuple):
     """(B, I)"""
     weights: FloatArray | None = None
     """(B, F) of the features: their product is what is paid."""
+
+
+@contextmanager
+def wide_products() -> Iterator[None]:
+    """Multiply float32 matrices by oneDNN where that is faster: on processors with AVX-512 and without AMX.
+
+    torch multiplies by MKL, which leaves half of the width of AMD's vectors unused: with oneDNN these learners make 1.4
+    times the env steps/s on Zen 5. torch has no other switch for it than to allow bfloat16. oneDNN rounds to that where
+    the processor has AMX, so not there.
+    """
+    products = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]
+    before = products.fp32_precision
+    if torch.cpu._is_avx512_supported() and not torch.cpu._is_amx_tile_supported():
+        products.fp32_precision = "bf16"
+    try:
+        yield
+    finally:
+        products.fp32_precision = before
 
 
 class SACLearner:

@@ -8,7 +8,7 @@ import torch
 from service.config.self_play import MCPConfig
 from service.config.skills import SACConfig
 from service.learner.off_policy import actions_at_random
-from service.learner.sac import Batch, SACLearner
+from service.learner.sac import Batch, SACLearner, wide_products
 from service.learner.sac_networks import Critics, GaussianActor, MCPActor, sample_actions
 from service.policies.networks import export_parameters
 from service.policies.numpy_actor import numpy_actor
@@ -263,3 +263,12 @@ def test_parameters_that_do_not_fit_are_refused(kind, change, words):
     parameters = export_parameters(actors()[kind]) | change
     with pytest.raises(PolicyError, match=words):
         numpy_actor({name: each for name, each in parameters.items() if each is not None})
+
+
+def test_products_are_of_float32_and_others_stay_as_they_are():
+    first, second = torch.randn(64, 64), torch.randn(64, 64)
+    exact = first.double() @ second.double()
+    before = torch.backends.mkldnn.matmul.fp32_precision
+    with wide_products():
+        assert (first @ second - exact).abs().max() < 1e-4  # bfloat16 has 0.1
+    assert torch.backends.mkldnn.matmul.fp32_precision == before
