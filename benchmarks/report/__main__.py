@@ -30,7 +30,7 @@ FILES = ("env_throughput", "throughput", "world_speed", "deployed", "mutation", 
          "transfer", "transfer_champion", "demo")  # fmt: skip
 """Names of the recorded files of which there is one each."""
 PAGES = {
-    "results/pretraining.md": ("skill", "seeds", "champion", "tasks", "curves", "curriculum", "coverage", "throughput"),
+    "results/pretraining.md": ("skill", "seeds", "others", "champion", "tasks", "curves", "curriculum", "coverage", "throughput"),
     "results/deployed.md": ("checks",),
     "results/skills.md": ("coverage", "curves", "controls"),
     "results/comparison.md": ("rows", "longer", "below", "harder", "missing"),
@@ -143,6 +143,7 @@ class Report:
         return {
             "skill": [recipe.recipe_words(studies[RECIPE]), time_to_skill.report(studies[RECIPE])],
             "seeds": [text(seeds[SEEDS]) for text in (recipe.recipe_words, pretraining.seeds_block) if SEEDS in seeds],
+            "others": [pretraining.other_seeds(name, study) for name, study in seeds.items() if name != SEEDS],
             "champion": [pretraining.champion_words(runs)],
             "tasks": [pretraining.tasks_table(runs)],
             "curves": [

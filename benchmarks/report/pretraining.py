@@ -7,7 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 from benchmarks.record_run import ASKED, ASKED_RATES, ASKED_STEPS, TASKS
-from benchmarks.report.markdown import Row, duration, millions, percent, table
+from benchmarks.report.markdown import Row, commit, duration, millions, percent, table
 from benchmarks.run_files import RANDOM, STAGES, Records, Run, binned, mean_share, steps_until, unthin
 from benchmarks.seeds import KINDS
 from service.config.self_play import SelfPlayConfig
@@ -81,6 +81,13 @@ def seeds_block(study: Mapping[str, Any]) -> str:
         counts.append(f"{sum(rate >= ASKED_RATES['mixed'] for rate in rates)} of {len(rates)} at {millions(asked)}")
     words = f"At least {percent(ASKED_RATES['mixed'])} of mixed goals: {', '.join(counts)} env steps."
     return f"{table(head, rows)}\n\n{words}"
+
+
+def other_seeds(name: str, study: Mapping[str, Any]) -> str:
+    """The same of another recipe than the one that ships, and when it was recorded."""
+    commits = ", ".join(sorted({commit(run["git_commit"]) for run in study["runs"]}))
+    when = ", ".join(sorted({run["machine"]["time"][:10] for run in study["runs"]}))
+    return f"`{name}`, {commits}, {when}:\n\n{seeds_block(study)}"
 
 
 def num_dips(curve: Sequence[Mapping[str, float]]) -> int:

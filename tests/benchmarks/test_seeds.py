@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from benchmarks import seeds
-from benchmarks.report.pretraining import num_dips, seeds_block
+from benchmarks.report.pretraining import num_dips, other_seeds, seeds_block
 from service.runs import train
 from tests.runs.runs import TREE, write_yaml
 
@@ -72,3 +72,8 @@ def test_the_table_of_seeds_by_hand():
         "",
         "At least 95 % of mixed goals: 1 of 2 at 2 M, 1 of 1 at 5 M env steps.",
     ]
+    for run, day in zip(runs, (27, 28), strict=True):
+        run |= {"git_commit": "fb14796" + 33 * "0", "machine": {"time": f"2026-11-{day}T08:00:00"}}
+    first, _, head, *_ = other_seeds("panda-cube-paper", {"runs": runs}).splitlines()
+    assert first == "`panda-cube-paper`, commit `fb14796`, 2026-11-27, 2026-11-28:"
+    assert head.startswith("| seed | 2 M: mixed")
