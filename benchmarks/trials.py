@@ -19,7 +19,7 @@ from benchmarks.report.results import FORMAT_VERSION, TRIAL, Result
 from service.actors.evaluation import DeterministicPolicy, IdlePolicy
 from service.base.errors import TandemError
 from service.base.jsonl import read_jsonl
-from service.base.version import git_commit
+from service.base.version import LEARNING_VERSION, git_commit
 from service.config import Config
 from service.config.load import parse_config
 from service.config.task import TaskConfig
@@ -75,7 +75,7 @@ def _play(config: TaskConfig, registry: Path) -> dict[str, Any]:
     player: DeterministicPolicy = IdlePolicy() if idle else load(config.primitives, registry).player()
     num, seed = config.run.final_episodes, config.seed + FINAL_SEED
     found = evaluate_on(find_task(config.task, config.code), config.world, player, num, seed, config.run.num_threads)
-    made = {"git_commit": git_commit(), "num_cores": os.cpu_count()}
+    made = {"git_commit": git_commit(), "learning_version": LEARNING_VERSION, "num_cores": os.cpu_count()}
     return {"evaluation": numbers_of(found), "env_steps": 0, "wall_s": 0.0, "made": made}
 
 

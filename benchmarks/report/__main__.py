@@ -30,7 +30,17 @@ FILES = ("env_throughput", "throughput", "world_speed", "deployed", "mutation", 
          "transfer", "transfer_champion", "demo")  # fmt: skip
 """Names of the recorded files of which there is one each."""
 PAGES = {
-    "results/pretraining.md": ("skill", "seeds", "others", "champion", "tasks", "curves", "curriculum", "coverage", "throughput"),
+    "results/pretraining.md": (
+        "skill",
+        "seeds",
+        "others",
+        "champion",
+        "tasks",
+        "curves",
+        "curriculum",
+        "coverage",
+        "throughput",
+    ),
     "results/deployed.md": ("checks",),
     "results/skills.md": ("coverage", "curves", "controls"),
     "results/comparison.md": ("rows", "longer", "below", "harder", "missing"),

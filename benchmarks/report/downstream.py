@@ -110,7 +110,14 @@ def _harder(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
 
 
 def check_versions(results: Sequence[Result]) -> None:
-    """Refuse results of other versions of the tasks than today's."""
+    """Refuse results of other versions of the tasks than today's, and of two versions of what learns."""
+    of = {result["made"].get("learning_version", 1): result[TRIAL] for result in results}
+    if len(of) > 1:
+        (one, first), (two, second), *_ = sorted(of.items())
+        raise TandemError(
+            f"{first['method']} on {first['task']} was recorded with version {one} of what learns, {second['method']} "
+            f"on {second['task']} with version {two}: they belong into two tables; reproduce one of them"
+        )
     for trial in (result[TRIAL] for result in results):
         if trial.get("task_version", 0) != find_task(trial["task"]).version:
             raise TandemError(

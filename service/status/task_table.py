@@ -2,7 +2,7 @@
 
 Only runs that differ in nothing but their seed are averaged. A row has the same primitives and world in all columns, as
 a table without them would compare methods that had different ones; its tasks may have had different settings, such as
-env steps. Two settings on one task make two rows.
+env steps. Two settings on one task make two rows, and so do two versions of what learns.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from zlib import crc32
 
 from service.base.errors import TandemError
 from service.base.parsing import parse_json
+from service.base.version import LEARNING_VERSION
 from service.config.tree import leaves, read_yaml
 from service.status.schemas import TaskCell, TaskColumn, TaskRow, TaskTable
 from service.store.models import RunStatus, Trial
@@ -95,6 +96,7 @@ def _read(run_id: str, trial: Trial, path: Path) -> _Run:
     settings = _settings(config, config.stat().st_mtime_ns)
     result = RunDirectory(path).read_result()
     ended = (path / RESULT_FILE).stat().st_mtime if result is not None else 0.0
+    made = {} if result is None else result.get("made", {})
     version = settings.get("task_version")
     column = (trial.task, version if isinstance(version, int) else 0)
     counted = {  # of a text of a user's its digest tells another
@@ -102,6 +104,7 @@ def _read(run_id: str, trial: Trial, path: Path) -> _Run:
         for key, value in settings.items()
         if _counts(key)
     }
+    counted["learning_version"] = LEARNING_VERSION if result is None else made.get("learning_version", 1)
     return _Run(run_id, trial, column, counted, ended, result)
 
 
@@ -125,7 +128,8 @@ def _rows(runs: Sequence[_Run]) -> list[dict[Column, list[_Run]]]:
         alike.setdefault(key, {}).setdefault(run.column, []).append(run)
     rows: dict[str, list[dict[Column, list[_Run]]]] = {}
     for found in sorted(alike.values(), key=lambda each: -len(each)):
-        world = {key: value for key, value in _first(found).settings.items() if key.startswith("world.")}
+        settings = _first(found).settings.items()
+        world = {key: value for key, value in settings if key.startswith("world.") or key == "learning_version"}
         same = rows.setdefault(json.dumps([_first(found).made, world], sort_keys=True), [])
         free = next((row for row in same if row.keys().isdisjoint(found)), None)
         if free is None:

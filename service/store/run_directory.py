@@ -45,7 +45,7 @@ from service.base.jsonl import Extent, JsonlWriter
 from service.base.lock import LOCK_FILE, DirectoryLock, claim_epoch, give_back_epoch, newest_epoch
 from service.base.parsing import parse_json
 from service.base.types import FloatArray, StateArray
-from service.base.version import git_commit
+from service.base.version import LEARNING_VERSION, git_commit
 from service.config import Config, dump_config, load_config
 from service.store.checkpoints import CheckpointStore
 from service.store.run_history import (
@@ -386,7 +386,7 @@ class RunDirectory:
 
 def encode_result(result: Mapping[str, JsonValue]) -> bytes:
     """A result as JSON, with what it was made by."""
-    made = {"git_commit": git_commit(), "num_cores": os.cpu_count()}
+    made = {"git_commit": git_commit(), "learning_version": LEARNING_VERSION, "num_cores": os.cpu_count()}
     return (json.dumps({**result, "made": made}, indent=1) + "\n").encode()
 
 

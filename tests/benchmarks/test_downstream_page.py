@@ -5,6 +5,7 @@ from PIL import Image
 
 from benchmarks.report.downstream import _mean_until, check_versions, draw_table
 from service.base.errors import TandemError
+from service.envs.tasks import find_task
 
 
 def result(method, task, seed, last, ever, curve=(), num=100):
@@ -37,6 +38,15 @@ def test_results_of_another_version_of_a_task_are_refused():
     check_versions([today])
     with pytest.raises(TandemError, match="another version"):
         check_versions([today, result("ours", "box", 0, 0.5, 0.5)])
+
+
+def test_results_of_two_versions_of_what_learns_are_refused():
+    old, new = result("ours", "push", 0, 0.5, 0.5), result("idle", "wall", 0, 0.5, 0.5)
+    old["cell"]["task_version"], new["cell"]["task_version"] = find_task("push").version, find_task("wall").version
+    new["made"] = {**new["made"], "learning_version": 2}
+    check_versions([new])
+    with pytest.raises(TandemError, match=r"ours on push was .* version 1 of what learns, idle on wall with version 2"):
+        check_versions([new, old])
 
 
 def test_how_soon_by_hand():

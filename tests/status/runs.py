@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from service.actors.evaluation import wilson_interval
+from service.base.version import LEARNING_VERSION
 from service.registry.names import Version
 from service.registry.registry import Registry
 from service.store.models import ActorStatus, GoalCell, GoalGrid, RunStatus
@@ -146,7 +147,12 @@ def write_trial(
     names = {"rollout/success_last": 0.25, "evaluation/success_last": success, "time/env_steps_per_s": 50.0}
     append(root, run_id, *({"iteration": i, "env_steps": 1000 * i, **names} for i in (1, 2)))
     if evaluation:
-        result = {"evaluation": evaluation, "made": {"git_commit": None}, "env_steps": 2000, "wall_s": 9.0}
+        result = {
+            "evaluation": evaluation,
+            "made": {"learning_version": LEARNING_VERSION},
+            "env_steps": 2000,
+            "wall_s": 9.0,
+        }
         (path / "result.json").write_text(json.dumps(result))
     return path
 

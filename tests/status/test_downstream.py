@@ -1,5 +1,6 @@
 """Runs that learn a task: the table of tasks, the list, the page of one, and stopping and resuming one."""
 
+import json
 import os
 import shlex
 import subprocess
@@ -79,6 +80,17 @@ def test_only_seeds_of_the_same_are_averaged(root):
     assert [cell.differs for cell in found.rows[1].cells] == [longer] * 2
     assert found.rows[3].cells[0].differs == {"run.total_env_steps": 2000, "world.object_mass_kg": 0.3}
     assert found.rows[0].cells[0].differs == {}
+
+
+def test_two_versions_of_what_learns_make_two_rows(root):
+    old = write_trial(root, "a", "push", "ours", 0, 0.2) / "result.json"
+    write_trial(root, "b", "push", "ours", 1, 0.4)
+    write_trial(root, "c", "wall", "ours", 0, 0.6)
+    result = json.loads(old.read_text())
+    del result["made"]["learning_version"]  # as until version 1
+    old.write_text(json.dumps(result))
+    assert shown(table(root)) == [("ours", "tiny@1", {"push": 0.4, "wall": 0.6}), ("ours", "tiny@1", {"push": 0.2})]
+    assert table(root).rows[1].cells[0].differs == {"learning_version": 1}
 
 
 def test_what_no_result_depends_on_makes_no_row(root):

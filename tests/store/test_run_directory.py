@@ -95,7 +95,7 @@ def test_notes_are_read_back_and_damaged_ones_named(directory):
     assert directory.read_published() == ("cube@3", "0" * 64)
     result = directory.read_result()
     assert (result["evaluation"], result["env_steps"], result["made"].keys()) == (
-        {"success": 0.5}, 7, {"git_commit", "num_cores"}
+        {"success": 0.5}, 7, {"git_commit", "learning_version", "num_cores"}
     )  # fmt: skip
     for name, read in (("published.json", directory.read_published), ("result.json", directory.read_result)):
         (directory.path / name).write_text('{"version": 1}')
