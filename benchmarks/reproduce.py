@@ -1,9 +1,10 @@
-"""Run every learning experiment of ``docs/results`` that has no file there, several at once.
+"""Run every learning experiment of the table that has no file in ``docs/results/v2``, several at once.
 
     python -m benchmarks.reproduce --list
     python -m benchmarks.reproduce --parallel 2
 
-That is the table of downstream tasks, the controls of self-play and skill discovery: some forty hours on two cores.
+That is the table of downstream tasks and skill discovery, some forty hours of one core, by today's version of what
+learns; ``docs/results`` has the table of version 1 until this one is whole.
 Each is one or more of the commands that anybody can type, and this prints them. What was stopped goes on from its run
 directory. Pictures and pages are made from the files afterwards, by ``python -m benchmarks.report``.
 """
@@ -20,20 +21,23 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from benchmarks.controls import CONTROLS
 from benchmarks.measuring import ROOT
+from service.base.version import LEARNING_VERSION
 from service.envs.tasks import PAPERS, find_task
 from service.methods.task_methods import METHODS
 
-PRIMITIVES = {0: "panda-cube@seed-0", 1: "panda-cube@seed-2", 2: "panda-cube@seed-3"}
-"""Versions in ``docs/results/primitives`` by the seed of the trials that take them: each has its own pre-training."""
+PRIMITIVES = {0: "panda-cube@seed-30", 1: "panda-cube@seed-31", 2: "panda-cube@seed-32"}
+"""Versions in ``primitives`` by the seed of the trials that take them: each has its own pre-training."""
+PAPER_PRIMITIVES = {seed: f"panda-cube-paper@seed-{10 + seed}" for seed in PRIMITIVES}
+"""The same, of the recipe as the paper has it."""
 SKILL_METHODS = ("lsd", "metra", "dads", "diayn")
 SKILL_ENV_STEPS = 4_000_000
 SKILL_HOLD_STEPS = 1
 """Env steps that an orchestrator holds a skill; 1, 5 and 25 were compared (log, T20)."""
-CONTROL_SEEDS = (0, 2)
 LONGER_ENV_STEPS = 1_000_000
-RESULTS, RUNS = ROOT / "docs" / "results", ROOT / "runs" / "reproduce"
+MANY_UPDATES = 32
+"""For 64 env steps, instead of 8."""
+RESULTS, RUNS = ROOT / "docs" / "results" / f"v{LEARNING_VERSION}", ROOT / "runs" / "reproduce"
 """Recorded files, and run directories."""
 Command = tuple[str, ...]
 
@@ -58,38 +62,39 @@ class Experiment:
 
 def experiments(out: Path = RESULTS) -> Iterator[Experiment]:
     """Everything, the most important first; ``out`` has recorded files, and the registry in its ``primitives``."""
-    tasks = PAPERS
+    tasks, nothing = PAPERS, tuple(f"scratch-{net}{her}" for her in ("-her", "") for net in ("monolithic", "mcp"))
     for seed in PRIMITIVES:
-        for method in ("ours-her", "ours", "ours-residual-her"):
-            yield from (_trial(out, task, method, seed) for task in tasks)
+        yield from (_trial(out, task, method, seed) for method in ("ours-her", "ours") for task in tasks)
+        yield _trial(out, "push", "ours-residual-her", seed)
         yield from (_trial(out, task, method, seed) for method in ("asp-only", "idle") for task in tasks)
-    yield from (_control(out, name, CONTROL_SEEDS[0]) for name in CONTROLS)
-    nothing = ("scratch-monolithic-her", "scratch-monolithic", "scratch-mcp-her", "scratch-mcp")
-    yield from (_trial(out, task, method, 0) for method in nothing for task in tasks)
-    yield from _skills(out, 0)
-    yield from (_trial(out, task, f"scratch-{net}-her", 1) for net in ("monolithic", "mcp") for task in tasks)
-    yield from (_control(out, name, CONTROL_SEEDS[1]) for name in CONTROLS)
-    yield from _skills(out, 1)
-    yield from (_trial(out, task, f"scratch-{net}-her", 2) for net in ("monolithic", "mcp") for task in tasks)
-    yield from _skills(out, 2)
-    for seed in (1, 2):
-        yield from (_trial(out, task, f"scratch-{net}", seed) for net in ("monolithic", "mcp") for task in tasks)
+    for seed in PRIMITIVES:
+        yield from (_trial(out, task, method, seed) for method in nothing for task in tasks)
+        yield from _skills(out, seed)
+    for task in ("inair", "sphere", "push"):
+        yield from (_longer(out, task, f"scratch-{net}-her") for net in ("monolithic", "mcp"))
+        yield _longer(out, task, "scratch-monolithic-her", MANY_UPDATES)
+    for seed, reference in PAPER_PRIMITIVES.items():
+        for method in ("ours", "asp-only"):
+            for task in tasks:
+                found = _table(out, "downstream_paper", task, method, seed, reference)
+                yield replace(found, group=f"{found.group}, as the paper pre-trains")
     for seed in (0, 1):
         for method in ("ours-her", "ours", "scratch-monolithic-her", "scratch-monolithic"):
             yield _trial(out, "hard-push", method, seed)
-    for task in ("push", "inair", "sphere"):
-        yield from (_longer(out, task, f"scratch-{net}-her") for net in ("monolithic", "mcp"))
-    yield from (_longer(out, "push", method) for method in ("ours-her", "ours-residual-her"))
 
 
 def _trial(out: Path, task: str, method: str, seed: int) -> Experiment:
     return _table(out, "downstream", task, method, seed, PRIMITIVES[seed])
 
 
-def _longer(out: Path, task: str, method: str) -> Experiment:
-    extra = ("--set", f"run.total_env_steps={LONGER_ENV_STEPS}")
-    found = _table(out, "downstream_longer", task, method, 0, PRIMITIVES[0], extra)
-    return replace(found, group="a million env steps", part=f"{task}-{method}")
+def _longer(out: Path, task: str, method: str, updates: int | None = None) -> Experiment:
+    """A trial of many env steps; ``updates`` for 64 of them, where that is not as usual."""
+    extra = ["--set", f"run.total_env_steps={LONGER_ENV_STEPS}"]
+    extra += [] if updates is None else ["--set", f"sac.gradient_steps={updates}"]
+    directory = "downstream_longer" if updates is None else f"downstream_longer_{updates}"
+    found = _table(out, directory, task, method, 0, PRIMITIVES[0], tuple(extra))
+    group = "a million env steps" + ("" if updates is None else f", {updates} updates")
+    return replace(found, group=group, part=f"{task}-{method}")
 
 
 def _table(
@@ -105,16 +110,6 @@ def _table(
     versions = out / "primitives" / "models" / reference.partition("@")[0]
     group, part = (METHODS[method].title, task) if task in PAPERS else (find_task(task).title, method)
     return Experiment(name, file, group, part, seed, (command,), versions)
-
-
-def _control(out: Path, name: str, seed: int) -> Experiment:
-    out /= "controls"
-    command = _python(
-        *("benchmarks.controls", name, "--seed", str(seed)),
-        *("--run-dir", str(RUNS / "controls"), "--out", str(out), "--set", "run.num_threads=1"),
-    )
-    file = out / f"{name}-{seed}.json"
-    return Experiment(f"controls/{name}-{seed}", file, "controls of self-play", name, seed, (command,))
 
 
 def _skills(out: Path, seed: int) -> Iterator[Experiment]:

@@ -21,7 +21,7 @@ from benchmarks.report import comparison, figures, measured, pretraining, recipe
 from benchmarks.report.downstream import draw_table, write_results
 from benchmarks.report.recipe import RECIPE
 from benchmarks.report.results import Result, read_all
-from benchmarks.reproduce import experiments
+from benchmarks.reproduce import RESULTS, experiments
 from benchmarks.run_files import Run
 from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
@@ -184,7 +184,7 @@ class Report:
             "longer": [],
             "below": [comparison.distances_table(trials)],
             "harder": [comparison.harder_table(trials)],
-            "missing": [comparison.missing_table(list(experiments(self._results)))],
+            "missing": [comparison.missing_table(list(experiments(self._results / RESULTS.name)))],
         }
         if longer:  # none was recorded yet
             picture = self.show("Success over more env steps", "downstream-longer", draw_table, longer)
