@@ -154,7 +154,7 @@ class Report:
             "skill": [recipe.recipe_words(studies[RECIPE]), time_to_skill.report(studies[RECIPE])],
             "seeds": [text(seeds[SEEDS]) for text in (recipe.recipe_words, pretraining.seeds_block) if SEEDS in seeds],
             "others": [pretraining.other_seeds(name, study) for name, study in seeds.items() if name != SEEDS],
-            "champion": [pretraining.champion_words(runs)],
+            "champion": [pretraining.champion_words(seeds[SEEDS])],
             "tasks": [pretraining.tasks_table(runs)],
             "curves": [
                 show("Over env steps", "pretraining", figures.draw_curves, runs),

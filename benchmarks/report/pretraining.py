@@ -23,20 +23,24 @@ DIGITS = 12
 """Of a digest on a page, as in the table of tasks."""
 
 
-def champion_words(runs: Sequence[Run]) -> str:
-    """The bundled champion: its version, digest, run, and what its manifest says it solved when it was published."""
+def champion_words(seeds: Mapping[str, Any]) -> str:
+    """The bundled champion: its version, digest, seed, and what its manifest says it solved when it was published.
+
+    Args:
+        seeds: recorded seeds of the recipe, of which it is one.
+    """
     bob = load(CHAMPION, BUNDLED)
     assert bob.manifest is not None  # it is a published version
     assert isinstance(bob.config, SelfPlayConfig)
-    alike = [run["name"] for run in runs if run["config"] == bob.manifest.config]
-    made_by = f"the run {alike[0]}" if alike else "made by no run that is recorded here"
     manifest, config = bob.manifest, bob.config
+    seed, known = manifest.config["seed"], {run["seed"] for run in seeds["runs"]}
+    told = f"seed {seed} of the table above" if seed in known else f"seed {seed}, which is not recorded"
     rates = ", ".join(
         f"{percent(manifest.metrics[f'evaluation/{goals}_success_last'], 1)} of {goals}"
         for goals in ("mixed", "air", "table")
     )
     return (
-        f"`{CHAMPION}`, in the package, is version {manifest.version}, {made_by}: seed {manifest.config['seed']}, "
+        f"`{CHAMPION}`, in the package, is version {manifest.version}, {told}: "
         f"{config.policy.bob.num_primitives} primitives, {millions(manifest.metrics['env_steps'])} env steps, "
         f"parameters `{parameters_digest(bob.primitives)[:DIGITS]}`. When it was published it had {rates} "
         f"goals, {config.run.final_episodes} of each."

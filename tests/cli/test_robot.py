@@ -42,7 +42,7 @@ def test_goals_are_played_logged_and_drawn_from_the_log(tmp_path):
         "run", "--robot", "mujoco", "--goal=-0.1,0.05,0.2", "--episodes", 2, "--steps", 6, "--log", log, "--json", *FAST
     )
     assert ran.exit_code == 0, ran.output
-    assert json.loads(ran.stdout) == {"policy": "panda-cube@6 (bundled)", "robot": "mujoco", "reached": 0, "goals": 2}
+    assert json.loads(ran.stdout) == {"policy": "panda-cube@7 (bundled)", "robot": "mujoco", "reached": 0, "goals": 2}
     header, *rows = read_jsonl(log)
     assert header["bridge"]["set_points_per_step"] == 2
     assert [(row["episode"], row["step"]) for row in rows] == [

@@ -37,7 +37,7 @@ def test_the_champions_card_says_what_its_manifest_says(tmp_path, monkeypatch):
     assert found == pytest.approx(rates, abs=1e-4)
     assert f"| mixed | {rates['mixed']:.1%} | {manifest.metrics['evaluation/mixed_success_ever']:.1%} |" in body
     assert f"| env steps | {manifest.metrics['env_steps']:,.0f} |" in body
-    assert "| parameters | 177," in body
+    assert "| parameters | 74," in body
     assert "```sh\npip install .\n```" in body  # no index has Tandem
     config = re.search(r"The whole configuration:\n\n```yaml\n(.*?)```", body, re.DOTALL)
     assert yaml.safe_load(config[1]) == manifest.config
