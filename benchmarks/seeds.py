@@ -74,6 +74,45 @@ def curve(directory: RunDirectory) -> list[dict[str, float]]:
     return [{kept[name]: row[name] for name in kept if name in row} for row in rows if next(iter(names)) in row]
 
 
+def record(
+    recipe: str, seeds: Sequence[int], at: Sequence[float], settings: Sequence[str], file: Path, runs: Path
+) -> None:
+    """Train and measure those seeds that the file lacks; see the head of this module.
+
+    Args:
+        recipe: name of a file of configs/pretrain.
+        seeds: of the runs.
+        at: env steps at which Bob is measured; a run ends at the last.
+        settings: overrides.
+        file: for results.
+        runs: directory of runs.
+
+    Raises:
+        TandemError: the file has other settings.
+    """
+    made_by = {"recipe": seed_config(recipe, 0, 1, settings).model_dump(mode="json"), "set": list(settings)}
+    for seed in seeds:
+        config = seed_config(recipe, seed, round(max(at)), settings)
+        result: dict[str, Any] = {"benchmark": "seeds", "settings": made_by, "runs": []}
+        if file.exists():
+            result = json.loads(file.read_text(encoding="utf-8"))
+        if result["settings"] != made_by:
+            raise TandemError(f"{file}: its seeds had other settings; name another file")
+        if seed in {run["seed"] for run in result["runs"]}:
+            continue
+        where, path = machine(), runs / f"{file.stem}-{seed}"
+        directory, _ = learn(config, runs / "registry", path)
+        run: dict[str, Any] = {"seed": seed, "measured": measure(directory, config, at), "curve": curve(directory)}
+        run |= {"git_commit": git_commit(), "machine": where}
+        if file.exists():  # another process may have run another seed meanwhile
+            result = json.loads(file.read_text(encoding="utf-8"))
+        result["runs"] = sorted([*result["runs"], run], key=lambda each: each["seed"])
+        write_json(file, result)
+        for row in run["measured"]:
+            rates = ", ".join(f"{kind} {100 * row[kind]['last']:.1f}" for kind in KINDS)
+            print(f"{file.stem}, seed {seed} at {row['env_steps'] / 1e6:.2f} M: {rates}", flush=True)
+
+
 @one_line_errors
 def main() -> int:
     """Parse the command line, train, measure, print."""
@@ -86,27 +125,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path, required=True, metavar="FILE", help="results; seeds it has are not run")
     given = parser.parse_args()
     at = [float(each) * 1e6 for each in given.at.split(",")]
-    settings = {"recipe": seed_config(given.recipe, 0, 1, given.set).model_dump(mode="json"), "set": given.set}
-    for seed in parse_seeds(given.seeds):
-        config = seed_config(given.recipe, seed, round(max(at)), given.set)
-        result: dict[str, Any] = {"benchmark": "seeds", "settings": settings, "runs": []}
-        if given.json.exists():
-            result = json.loads(given.json.read_text(encoding="utf-8"))
-        if result["settings"] != settings:
-            raise TandemError(f"{given.json}: its seeds had other settings; name another file")
-        if seed in {run["seed"] for run in result["runs"]}:
-            continue
-        where, path = machine(), given.runs / f"{given.json.stem}-{seed}"
-        directory, _ = learn(config, given.runs / "registry", path)
-        run: dict[str, Any] = {"seed": seed, "measured": measure(directory, config, at), "curve": curve(directory)}
-        run |= {"git_commit": git_commit(), "machine": where}
-        if given.json.exists():  # another process may have run another seed meanwhile
-            result = json.loads(given.json.read_text(encoding="utf-8"))
-        result["runs"] = sorted([*result["runs"], run], key=lambda each: each["seed"])
-        write_json(given.json, result)
-        for row in run["measured"]:
-            rates = ", ".join(f"{kind} {100 * row[kind]['last']:.1f}" for kind in KINDS)
-            print(f"seed {seed} at {row['env_steps'] / 1e6:.2f} M: {rates}", flush=True)
+    record(given.recipe, parse_seeds(given.seeds), at, given.set, given.json, given.runs)
     return 0
 
 

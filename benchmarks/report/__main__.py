@@ -34,6 +34,7 @@ PAGES = {
         "skill",
         "seeds",
         "others",
+        "why",
         "champion",
         "tasks",
         "curves",
@@ -154,6 +155,7 @@ class Report:
             "skill": [recipe.recipe_words(studies[RECIPE]), time_to_skill.report(studies[RECIPE])],
             "seeds": [text(seeds[SEEDS]) for text in (recipe.recipe_words, pretraining.seeds_block) if SEEDS in seeds],
             "others": [pretraining.other_seeds(name, study) for name, study in seeds.items() if name != SEEDS],
+            "why": [pretraining.why_alice_table(read_all(self._results / "why_alice"))],
             "champion": [pretraining.champion_words(seeds[SEEDS])],
             "tasks": [pretraining.tasks_table(runs)],
             "curves": [

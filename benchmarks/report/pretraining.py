@@ -9,14 +9,18 @@ from typing import Any
 from benchmarks.record_run import ASKED, ASKED_RATES, ASKED_STEPS, TASKS
 from benchmarks.report.markdown import Row, commit, duration, millions, percent, table
 from benchmarks.run_files import RANDOM, STAGES, Records, Run, binned, mean_share, steps_until, unthin
-from benchmarks.seeds import KINDS
+from benchmarks.seeds import KINDS, NUM_EPISODES
+from benchmarks.why_alice import ARMS
 from service.config.self_play import SelfPlayConfig
+from service.methods.task_evaluation import rate_of
 from service.registry.bundled import BUNDLED
 from service.registry.loading import load, parameters_digest
 
 NUM_BINS = 10
 """Equal parts of a run's env steps; rates are those of the last, distances and heights also those of the first."""
 CHAMPION = "panda-cube@champion"
+WHY_KINDS = ("mixed", "table", "air")
+"""Goals by which arms are judged."""
 DIPS_FROM = 4e6
 """Env steps from which on two evaluations in a row below what is asked for are a dip."""
 DIGITS = 12
@@ -92,6 +96,29 @@ def other_seeds(name: str, study: Mapping[str, Any]) -> str:
     commits = ", ".join(sorted({commit(run["git_commit"]) for run in study["runs"]}))
     when = ", ".join(sorted({run["machine"]["time"][:10] for run in study["runs"]}))
     return f"`{name}`, {commits}, {when}:\n\n{seeds_block(study)}"
+
+
+def why_alice_table(studies: Mapping[str, Mapping[str, Any]]) -> str:
+    """What is left of success without a part of self-play: the mean of the seeds and its interval, at the last step.
+
+    Args:
+        studies: recorded seeds by the names of the arms.
+    """
+    asked = ASKED_RATES["mixed"]
+    head = ("", *WHY_KINDS, f"at least {percent(asked)} of mixed")
+    rows = []
+    for name, arm in ARMS.items():
+        if name not in studies:
+            continue
+        found = [run["measured"][-1] for run in studies[name]["runs"]]
+        rates = (rate_of([_evaluated(row[kind]["last"]) for row in found]) for kind in WHY_KINDS)
+        enough = sum(row["mixed"]["last"] >= asked for row in found)
+        rows.append((arm.title, *(str(rate).replace("*", "\\*") for rate in rates), f"{enough} of {len(found)}"))
+    return table(head, rows) if rows else ""
+
+
+def _evaluated(rate: float) -> dict[str, Any]:
+    return {"evaluation": {"success_last": rate, "num_episodes": NUM_EPISODES}}
 
 
 def num_dips(curve: Sequence[Mapping[str, float]]) -> int:

@@ -6,7 +6,8 @@ import sys
 import pytest
 
 from benchmarks import seeds
-from benchmarks.report.pretraining import num_dips, other_seeds, seeds_block
+from benchmarks.report.pretraining import num_dips, other_seeds, seeds_block, why_alice_table
+from benchmarks.why_alice import ARMS
 from service.runs import train
 from tests.runs.runs import TREE, write_yaml
 
@@ -77,3 +78,24 @@ def test_the_table_of_seeds_by_hand():
     first, _, head, *_ = other_seeds("panda-cube-paper", {"runs": runs}).splitlines()
     assert first == "`panda-cube-paper`, commit `fb14796`, 2026-11-27, 2026-11-28:"
     assert head.startswith("| seed | 2 M: mixed")
+
+
+def test_what_alice_is_for_by_hand():
+    def study(*rates):
+        return {"runs": [{"measured": [{kind: {"last": rate} for kind in seeds.KINDS}]} for rate in rates]}
+
+    lines = why_alice_table({"recipe": study(0.98, 0.96, 0.94), "no-cloning": study(0.5)}).splitlines()
+    # the mean, and 4.303 times 0.02 / sqrt(3) to both sides
+    assert lines[2].startswith("| the recipe | 96.0 % [91, 100] (3) |")
+    assert lines[2].endswith("| 2 of 3 |")
+    assert lines[3].startswith("| the recipe, and Bob clones nothing | 50.0 % [47, 53]")
+    assert len(lines) == 4
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_each_arm_is_a_configuration_that_differs_in_what_it_says(name):
+    arm = ARMS[name]
+    config, recipe = (seeds.seed_config("panda-cube", 20, 1000, settings) for settings in (arm.settings, ()))
+    same = config == recipe
+    assert same == (name == "recipe")
+    assert (arm.env_steps < 4_000_000) == (not config.game.alice_plays)
