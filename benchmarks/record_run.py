@@ -33,6 +33,7 @@ from service.config import Config
 from service.config.skills import SkillDiscoveryConfig
 from service.envs.task import EPISODE_STEPS, Task
 from service.envs.tasks import find_task
+from service.generator.records import of_furthest
 from service.media.artifacts import COVERAGE_STEPS
 from service.media.figures import read_records
 from service.policies.frozen_skills import FrozenSkills
@@ -119,7 +120,7 @@ def count_goals(records: Records, rest_height_m: float) -> dict[str, Any]:
     """Goals and solved goals by time, by height above where the object rests, and by distance from its start.
 
     Args:
-        records: of ``goals.jsonl``, each goal 7 numbers: start x y z, goal x y z in metres, solved 0 or 1.
+        records: of ``goals.jsonl``, see ``sampled_goals``.
         rest_height_m: of the object's centre on the table.
 
     Returns:
@@ -127,10 +128,10 @@ def count_goals(records: Records, rest_height_m: float) -> dict[str, Any]:
         for each slice a list of counts, one for each bin of 2.5 cm.
     """
     end = records[-1]["env_steps"]
-    rows = [(record["env_steps"], *goal) for record in records for goal in record["goals"]]
-    goals = np.array(rows, dtype=np.float64).reshape(len(rows), 8)
-    goals = goals[np.isfinite(goals).all(axis=1)]
-    time, start, goal, solved = goals[:, 0], goals[:, 1:4], goals[:, 4:7], goals[:, 7]
+    goals = of_furthest([goal for record in records for goal in record["goals"]])
+    time = np.array([record["env_steps"] for record in records for _ in record["goals"]], dtype=np.float64)
+    finite = np.isfinite(goals).all(axis=1)
+    time, start, goal, solved = time[finite], goals[finite, :3], goals[finite, 3:6], goals[finite, 6]
     slices = np.minimum((time / end * NUM_SLICES).astype(int), NUM_SLICES - 1)
     values = {"height": goal[:, 2] - rest_height_m, "distance": np.linalg.norm(goal - start, axis=1)}
     return {"env_steps": end} | {name: _count(slices, value, solved, name) for name, value in values.items()}
@@ -169,8 +170,10 @@ def measure_tasks(
     Returns:
         Rows as ``tandem evaluate --json`` prints them; ``policy`` is "bob" or "idle", ``goals`` the task's name.
     """
-    rows = []
-    for name, task in TASKS.items():
+    rows, tasks = [], TASKS
+    if config.world.num_objects > 1:
+        tasks = {name: task for name, task in TASKS.items() if name != "sphere"} | {"one": Task("One", goals="one")}
+    for name, task in tasks.items():
         for label, policy in {"bob": bob, "idle": IdlePolicy()}.items():
             result = evaluate(
                 policy,

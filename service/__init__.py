@@ -115,7 +115,7 @@ def evaluate(
     Args:
         trained: as ``load`` gives it.
         task: to be played in place of its own, by name or file.
-        goals: ``table``, ``air``, ``volume`` or ``mixed`` in place of the task's.
+        goals: ``table``, ``air``, ``volume``, ``mixed`` or ``one`` in place of the task's.
         num_episodes: each from a fresh reset.
         seed: of the episodes.
     """

@@ -15,7 +15,7 @@ from service.base.progress import counted
 from service.base.types import FloatArray, StateArray
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.observations import ACTION
+from service.envs.observations import ACTION, each_object
 from service.policies.frozen_skills import FrozenSkills, SkillPlayer
 
 NUM_SKILLS = 32
@@ -28,7 +28,7 @@ class Composable(Protocol):
     num_primitives: int
 
     def compose(self, positions: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(N, 11) positions and (N, K) weights to the composition's mean and std, (N, 4) each."""
+        """(N, P) positions and (N, K) weights to the composition's mean and std, (N, 4) each."""
 
 
 class RandomPolicy:
@@ -100,14 +100,14 @@ def object_paths(
     num_threads: int = 0,
     observe: Callable[[WorldBatch], None] = lambda worlds: None,
 ) -> StateArray:
-    """Object positions while ``act``, (N, 11) positions to (N, 4) actions, plays N worlds from fresh resets.
+    """Object positions while ``act``, (N, P) positions to (N, 4) actions, plays N worlds from fresh resets.
 
     ``observe`` is called at the start and after each step.
 
     Returns:
-        (num_paths, num_steps + 1, 3) metres.
+        (num_paths, num_steps + 1, 3) metres; of K objects K times as many, those of a world one after the other.
     """
-    paths = np.empty((num_paths, num_steps + 1, 3))
+    paths = np.empty((num_paths, num_steps + 1, 3 * config.num_objects))
     with WorldBatch(config, num_paths, num_threads=num_threads) as worlds:
         worlds.reset(rng)
         paths[:, 0] = worlds.object_position
@@ -116,7 +116,7 @@ def object_paths(
             worlds.step(act(worlds.positions()))
             paths[:, step + 1] = worlds.object_position
             observe(worlds)
-    return paths
+    return each_object(paths).swapaxes(1, 2).reshape(-1, num_steps + 1, 3)
 
 
 def visited_share(trajectories: StateArray, workspace: WorkspaceConfig, *, cell_size_m: float = 0.05) -> float:

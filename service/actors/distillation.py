@@ -14,7 +14,7 @@ from service.base.liveness import count_work
 from service.base.types import BoolArray, FloatArray, IntArray, StateArray
 from service.config.distillation import DistillingConfig
 from service.envs.batch import WorldBatch
-from service.envs.observations import Layouts, bob_observation
+from service.envs.observations import Layouts, bob_observation, distances
 from service.envs.sampling import draw_goals
 from service.policies.numpy_policy import NumpyMCPPolicy
 
@@ -43,11 +43,11 @@ class Round:
 
     lesson: Lesson
     start: StateArray
-    """(M, 3) where the object was at first, in the episodes in which the student's own gate acted, metres."""
+    """(M, 3 K) where the objects were at first, in the episodes in which the student's own gate acted, metres."""
     goal: StateArray
-    """(M, 3) of the same episodes, metres."""
+    """(M, 3 K) of the same episodes, metres."""
     solved: BoolArray
-    """(M,) whether the object was there at the end."""
+    """(M,) whether all objects were there at the end."""
     num_env_steps: int
     diverged: tuple[tuple[StateArray, FloatArray], ...]
     """(last finite state, action) where physics diverged, which leaves a world as it was."""
@@ -92,7 +92,7 @@ class DistillationWorlds:
             late = worlds.states[:, worlds.layout["delay"]].ravel().astype(np.int64)
         composed = rng.random(num) < how.random_fraction
         steps = [self._step(student, goal, composed, step, rng) for step in range(how.episode_steps + self._most_late)]
-        reached = np.linalg.norm(worlds.object_position - goal, axis=1) <= distance_m
+        reached = np.all(distances(worlds.object_position, goal) <= distance_m, axis=1)
         answered = np.arange(how.episode_steps)[:, None] + late, np.arange(num)
         observation = np.stack([step.observation for step in steps[: how.episode_steps]])
         answers = (np.stack([getattr(step, each.name) for step in steps])[answered] for each in fields(Lesson)[1:])

@@ -13,17 +13,15 @@ from service.base.progress import doing
 from service.base.types import BoolArray, FloatArray, Metrics, StateArray
 from service.config import Config, WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.observations import ACTION, bob_observation
+from service.envs.observations import ACTION, bob_observation, distances
 from service.envs.rules import Rules
 from service.envs.sampling import GoalKind
 from service.envs.task import Task
 
 Observer = Callable[[WorldBatch, StateArray, BoolArray], None]
-"""Called with the worlds, their (N, 3) goals, metres, and (N,) whether they are solved, at the start and after each
+"""Called with the worlds, their (N, 3 K) goals, metres, and (N,) whether they are solved, at the start and after each
 step."""
 
-EVALUATED_GOALS: tuple[GoalKind, ...] = ("table", "air", "mixed")
-"""Kinds of goals on which a run evaluates its Bob."""
 EVALUATION_SEED = 1_000_003
 """Evaluations during a run always use the same goals, so that they compare."""
 REPORTED_SEED = EVALUATION_SEED + 1
@@ -63,11 +61,16 @@ class Evaluation:
     success_ever: float
     """Share that is solved after any step."""
     mean_distance_m: float
-    """Mean distance to the goal at the last step."""
+    """Mean distance of the objects to their goals at the last step."""
 
     def as_dict(self) -> dict[str, float | int | str]:
         """The rates by name, for JSON."""
         return asdict(self)
+
+
+def evaluated_goals(world: WorldConfig) -> tuple[GoalKind, ...]:
+    """Kinds of goals on which a run evaluates its Bob; of several objects also goals for one alone."""
+    return ("table", "air", "mixed") if world.num_objects == 1 else ("table", "air", "mixed", "one")
 
 
 def evaluate(
@@ -86,7 +89,7 @@ def evaluate(
     """Play ``num_episodes`` goals from fresh resets; nothing ends an episode early.
 
     ``observe`` records the episodes; it changes nothing in the result. Goals are as the task draws them, or random of a
-    kind; or (N, 3) ``goal``, metres.
+    kind; or (N, 3 K) ``goal``, metres.
     """
     rng = np.random.default_rng(seed)
     with WorldBatch(config, num_episodes, num_threads=num_threads) as worlds:
@@ -107,7 +110,7 @@ def evaluate(
                 if observe:
                     observe(worlds, goal, last)
                 shown.advance(num_episodes)
-        distance = np.linalg.norm(worlds.object_position - goal, axis=1)
+        distance = distances(worlds.object_position, goal)
     low, high = wilson_interval(int(last.sum()), num_episodes)
     return Evaluation(
         goals=rules.task.goal_kind,

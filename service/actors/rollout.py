@@ -6,6 +6,7 @@ states float64.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -67,6 +68,12 @@ class Demonstrations:
     """(D, O) input of the player that clones; Bob's has the goal that was reached."""
     action: FloatArray
     """(D, A)."""
+
+
+def join_demonstrations(parts: Sequence[Demonstrations]) -> Demonstrations:
+    """All steps of several parts, in their order."""
+    observation = np.concatenate([part.observation for part in parts])
+    return Demonstrations(observation, np.concatenate([part.action for part in parts]))
 
 
 @dataclass(frozen=True, slots=True)

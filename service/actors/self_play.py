@@ -1,32 +1,33 @@
 """Asymmetric self-play: one round of Alice, then Bob, on a batch of worlds.
 
-Alice acts from s0 for a number of steps, fixed or drawn; where the object then is becomes the goal. The worlds go back
-to s0, and Bob acts until he has held the object there or his time is over. The next round of the game starts where
-Alice ended, so games reach grasped objects by themselves; an invalid goal ends the game (OpenAI 2021, section 3).
+Alice acts from s0 for a number of steps, fixed or drawn; where the objects then are becomes the goal. The worlds go
+back to s0, and Bob acts until he has held the objects there or his time is over. The next round of the game starts
+where Alice ended, so games reach grasped objects by themselves; an invalid goal ends the game (OpenAI 2021, section 3).
+Some goals may span two rounds: they lead from the start of the round before, as one short turn moves one object.
 Without Alice, a control, Bob plays goals of the task generator, and the next round starts where he ended.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.actors.rollout import Demonstrations, Rollout, Turns
+from service.actors.rollout import Demonstrations, Rollout, Turns, join_demonstrations
 from service.base.liveness import count_work
 from service.base.types import Arrays, BoolArray, FloatArray, IntArray, Metrics, StateArray
 from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
-from service.envs.observations import ACTION, bob_observation
+from service.envs.observations import ACTION, bob_observation, distances, each_object
 from service.generator.bins import GoalCells
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import GoalRecords
 from service.generator.ring import Rows
 from service.generator.snapshot import GoalChoice
-from service.generator.validity import Verdict, classify_goal, in_workspace
+from service.generator.validity import Verdict, classify_goal, in_workspace, proposed
 
 VerdictArray = NDArray[np.int8]
 _HINDSIGHT_STRIDE = 4
@@ -43,6 +44,8 @@ class StochasticPolicy(Protocol):
 
 ChooseGoals = Callable[[StateArray, StateArray, IntArray, StateArray, VerdictArray], GoalChoice]
 """Start state, start position, round index, proposal and verdict of a round to Bob's goals (``GeneratorSnapshot``)."""
+SPANNING_SHARE = 0.5
+"""Of the goals that may lead from the start of the round before, so many do."""
 Observer = Callable[[StateArray], None]
 """Called with the (N, S) states at the start of a turn and after each of its steps; it must copy what it keeps."""
 
@@ -56,6 +59,17 @@ class Players:
     bob: StochasticPolicy
     past_alice: Sequence[StochasticPolicy] = ()
     past_bob: Sequence[StochasticPolicy] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _RoundBefore:
+    """What goals that span two rounds need of the last one."""
+
+    alice: Turns
+    start_state: StateArray
+    """(N, S)."""
+    start_position: StateArray
+    """(N, 3 K)."""
 
 
 class SelfPlay:
@@ -94,6 +108,9 @@ class SelfPlay:
         self.cells = GoalCells(config.world, config.generator.cell_size_m)
         self.reached: IntArray = np.zeros(len(self.cells), dtype=np.int64)
         """(cells,) steps of the last round after which an object was there."""
+        self.proposed_from: StateArray = np.zeros((config.game.num_worlds, 3 * config.world.num_objects))
+        """(N, 3 K) places from which the last round's proposals lead."""
+        self._before: _RoundBefore | None = None
         self.block_grippers(0.0)
         self.worlds.reset(rng)
 
@@ -132,10 +149,17 @@ class SelfPlay:
         start_state, start_position = worlds.states.copy(), worlds.object_position.copy()
         play_alice = self._play_alice if game.alice_plays else self._leave_alice_out
         alice, contacts, diverged = play_alice(players, plan, observe)
-        end_state, proposal = worlds.states.copy(), worlds.object_position.copy()
-        verdict = classify_goal(start_position, proposal, self.config.world.workspace, game.success_distance_m)
+        end_state, end_position = worlds.states.copy(), worlds.object_position.copy()
+        verdict = classify_goal(start_position, end_position, self.config.world.workspace, game.success_distance_m)
         verdict[diverged] = Verdict.FALLEN
-        choice = choose_goals(start_state, start_position, self._round_index, proposal, verdict)
+        spanning = self._spanning(end_position, verdict == Verdict.VALID)
+        this_round = _RoundBefore(alice, start_state.copy(), start_position.copy())
+        if self._before is not None:
+            start_state[spanning] = self._before.start_state[spanning]
+            start_position[spanning] = self._before.start_position[spanning]
+        self.proposed_from = start_position
+        proposal = proposed(start_position, end_position, game.success_distance_m)
+        choice = choose_goals(start_state, start_position, self._round_index - spanning, proposal, verdict)
 
         worlds.restore(choice.start_state)
         bob, solved, diverged = self._play_bob(players, plan, choice, observe)
@@ -162,7 +186,7 @@ class SelfPlay:
         if game.alice_plays:
             self._continue_games(end_state, verdict == Verdict.VALID)
         else:
-            inside = in_workspace(achieved, self.config.world.workspace)
+            inside = in_workspace(each_object(achieved), self.config.world.workspace).all(axis=1)
             self._continue_games(worlds.states.copy(), inside & ~diverged)
         num_bob_steps = int(bob.active.sum())
         rollout = Rollout(
@@ -172,7 +196,7 @@ class SelfPlay:
             policy_version=players.version,
             alice=alice,
             bob=bob,
-            demonstrations=self._demonstrations(alice, bob, records, achieved),
+            demonstrations=self._demonstrations(alice, bob, records, achieved, spanning),
             records=records,
             num_env_steps=(num_env_steps := int(alice.active.sum()) + num_bob_steps),
             metrics=_contact_metrics(contacts) | {"bob/env_steps_fraction": num_bob_steps / max(num_env_steps, 1)},
@@ -180,18 +204,31 @@ class SelfPlay:
         )
         worlds.diverged = []
         self._sequence += 1
+        self._before = this_round if game.goal_rounds > 1 else None
         return rollout
+
+    def _spanning(self, end_position: StateArray, valid: BoolArray) -> BoolArray:
+        """(N,) worlds whose goal leads from the start of the round before."""
+        if self._before is None:
+            return np.zeros(len(valid), dtype=bool)
+        game = self.config.game
+        far = classify_goal(
+            self._before.start_position, end_position, self.config.world.workspace, game.success_distance_m
+        )
+        chosen = self._rng.random(len(valid)) < SPANNING_SHARE
+        spanning: BoolArray = chosen & valid & (far == Verdict.VALID) & (self._round_index > 0)
+        return spanning
 
     def _play_alice(
         self, players: Players, plan: RoundPlan, observe: Observer | None
     ) -> tuple[Turns, BoolArray, BoolArray]:
-        """Alice's turns, without the reward of her goal; (N, 2) finger contacts; (N,) worlds whose physics diverged."""
+        """Alice's turns, without the reward of her goal; (N, 2 K) finger contacts; (N,) worlds that diverged."""
         game, worlds = self.config.game, self.worlds
         num_steps = int(self._rng.integers(game.alice_steps_min or game.alice_steps, game.alice_steps + 1))
         size = worlds.observed.full.size
         turns = _empty_turns(game.alice_steps, worlds.num_worlds, size, size, learn=~plan.alice_past)
         all_worlds = np.arange(worlds.num_worlds)
-        contacts = np.zeros((worlds.num_worlds, 2), dtype=bool)
+        contacts = np.zeros((worlds.num_worlds, 2 * self.config.world.num_objects), dtype=bool)
         diverged = np.zeros(worlds.num_worlds, dtype=bool)
         if observe:
             observe(worlds.states)
@@ -229,18 +266,21 @@ class SelfPlay:
     ) -> tuple[Turns, BoolArray, BoolArray]:
         """Bob's turns; (N,) solved; (N,) worlds whose physics diverged.
 
-        A world's turn ends when its object has been at the goal for ``bob_hold_steps`` steps in a row, or its physics
-        diverged. The others go on; ``playing`` holds their indices.
+        A world's turn ends when its objects have been at their goals for ``bob_hold_steps`` steps in a row, or its
+        physics diverged. The others go on; ``playing`` holds their indices.
         """
         game, worlds = self.config.game, self.worlds
         num = worlds.num_worlds
         sizes = worlds.observed.bob.size, worlds.observed.bob_value.size
         turns = _empty_turns(game.bob_steps, num, *sizes, learn=choice.played & ~plan.bob_past)
-        solved, diverged = np.zeros(num, dtype=bool), np.zeros(num, dtype=bool)
+        diverged = np.zeros(num, dtype=bool)
         num_held: IntArray = np.zeros(num, dtype=np.int64)
         margin_m = game.bob_margin_m if players.version >= game.bob_margin_after_updates else 0.0
         reach_m = game.success_distance_m - margin_m
         playing = np.flatnonzero(choice.played)
+        there: BoolArray = distances(worlds.object_position, choice.goal) <= reach_m
+        # What lies at its goal counts as there, unless there is nothing else to do.
+        there &= ~np.all(there, axis=1, keepdims=True)
         if observe:
             observe(worlds.states)
         for step in range(game.bob_steps):
@@ -256,20 +296,28 @@ class SelfPlay:
             if observe:
                 observe(worlds.states)
             self._count_reached(playing[~diverged[playing]])
-            reached = np.linalg.norm(worlds.object_position - choice.goal, axis=1) <= reach_m
-            # Reaching the goal earns the reward and leaving it takes the reward back; ``solved`` is the step before.
-            turns.reward[step, playing] = game.bob_success_reward * (reached.astype(np.float32) - solved)[playing]
-            solved[playing] = reached[playing]
-            num_held = np.where(reached, num_held + 1, 0)
+            reached = distances(worlds.object_position, choice.goal) <= reach_m
+            # Reaching a goal earns the reward and leaving it takes the reward back; ``there`` is the step before.
+            turns.reward[step, playing] = (self._worth(reached) - self._worth(there))[playing]
+            there[playing] = reached[playing]
+            num_held = np.where(reached.all(axis=1), num_held + 1, 0)
             over = num_held >= game.bob_hold_steps
             turns.terminated[step, playing] = over[playing]
             playing = playing[~(over | diverged)[playing]]
         turns.final_value_observation[:] = worlds.bob_value(choice.goal)
+        solved: BoolArray = np.all(there, axis=1)
         return turns, solved, diverged
+
+    def _worth(self, there: BoolArray) -> FloatArray:
+        """(N,) reward of having (N, K) objects at their goals."""
+        game = self.config.game
+        worth: FloatArray = game.bob_success_reward * there.sum(axis=1, dtype=np.float32)
+        return worth + game.bob_all_reward * there.all(axis=1).astype(np.float32)
 
     def _count_reached(self, worlds: IntArray) -> None:
         position = self.worlds.object_position[worlds]
-        self.reached += self.cells.count(position[in_workspace(position, self.config.world.workspace)])
+        inside = in_workspace(each_object(position), self.config.world.workspace)
+        self.reached += self.cells.count(self.cells.index(position)[inside])
 
     def _reward_alice(
         self, alice: Turns, verdict: VerdictArray, tried: BoolArray, solved: BoolArray, novelty: StateArray
@@ -282,10 +330,15 @@ class SelfPlay:
         # What a valid goal was worth is unknown where Bob could not try it.
         alice.learn[valid & ~tried] = False
 
-    def _demonstrations(self, alice: Turns, bob: Turns, records: GoalRecords, achieved: StateArray) -> Demonstrations:
+    def _demonstrations(
+        self, alice: Turns, bob: Turns, records: GoalRecords, achieved: StateArray, spanning: BoolArray
+    ) -> Demonstrations:
         """Alice's turns for the goals the current Bob failed; with hindsight, also steps of his own failures."""
         failed = records.played & ~records.solved & ~records.bob_past
         by_alice = self._relabelled(alice, failed & ~records.replayed, records.goal)
+        if self._before is not None:  # of goals that span two rounds, both
+            before = self._relabelled(self._before.alice, failed & ~records.replayed & spanning, records.goal)
+            by_alice = join_demonstrations([before, by_alice])
         if not self.config.learner.abc.hindsight:
             return by_alice
         config = self.config
@@ -295,15 +348,12 @@ class SelfPlay:
         every = -(-len(by_bob.observation) // max(1, len(by_alice.observation))) or 1
         if not config.game.alice_plays:
             every = _HINDSIGHT_STRIDE
-        return Demonstrations(
-            np.concatenate([by_alice.observation, by_bob.observation[::every]]),
-            np.concatenate([by_alice.action, by_bob.action[::every]]),
-        )
+        return join_demonstrations([by_alice, Demonstrations(by_bob.observation[::every], by_bob.action[::every])])
 
     def _relabelled(self, turns: Turns, chosen: BoolArray, goal: StateArray) -> Demonstrations:
-        """The turns of the ``chosen`` worlds (N,) with Bob's input: demonstrations of how to reach ``goal`` (N, 3)."""
+        """Demonstrations, with Bob's input, of how to reach (N, 3 K) goals: the turns of the ``chosen`` worlds (N,)."""
         active = turns.active & chosen
-        goals = np.broadcast_to(goal, (*active.shape, 3))[active]
+        goals = np.broadcast_to(goal, (*active.shape, goal.shape[1]))[active]
         positions = turns.observation[active][:, : self.worlds.observed.positions.size]
         return Demonstrations(bob_observation(positions, goals), turns.action[active])
 
@@ -317,12 +367,17 @@ class SelfPlay:
 
     def state(self) -> Arrays:
         """Everything later rounds depend on, except the random generator, which its owner saves."""
-        return {
+        own = {
             "worlds": self.worlds.states.copy(),
             "round_index": self._round_index.copy(),
             "sequence": np.array(self._sequence),
             "num_broken": np.array(self.worlds.num_diverged),
         }
+        if self._before is not None:
+            before = self._before
+            own |= {"before_state": before.start_state, "before_position": before.start_position}
+            own |= {f"before_{field.name}": getattr(before.alice, field.name) for field in fields(Turns)}
+        return own
 
     def load_state(self, state: Arrays) -> None:
         """Continue exactly where ``state`` was taken."""
@@ -330,6 +385,9 @@ class SelfPlay:
         self._round_index = np.asarray(state["round_index"], dtype=np.int64).copy()
         self._sequence = int(state["sequence"])
         self.worlds.num_diverged = int(state["num_broken"])
+        if "before_state" in state:
+            alice = Turns(**{field.name: state[f"before_{field.name}"] for field in fields(Turns)})
+            self._before = _RoundBefore(alice, state["before_state"], state["before_position"])
 
 
 def _act(
@@ -368,7 +426,8 @@ def _empty_turns(num_steps: int, num: int, observation_size: int, value_size: in
 
 
 def _contact_metrics(contacts: BoolArray) -> Metrics:
+    both: BoolArray = np.all(contacts.reshape(len(contacts), -1, 2), axis=2)
     return {
         "alice/contact_fraction": float(contacts.any(axis=1).mean()),
-        "alice/both_contact_fraction": float(contacts.all(axis=1).mean()),
+        "alice/both_contact_fraction": float(both.any(axis=1).mean()),
     }

@@ -41,7 +41,7 @@ GoalsOption = Annotated[
     typer.Option(
         "--goals",
         metavar="KIND|POINTS",
-        help="table, air, volume or mixed; or points in metres, such as '0.1,0,0.2; 0,-0.1,0.025'.",
+        help="table, air, volume, mixed or one; or points in metres, such as '0.1,0,0.2; 0,-0.1,0.025'.",
     ),
 ]
 _SIZES = (64, 4096)
@@ -57,7 +57,8 @@ def evaluate(
     goals: Annotated[
         str | None,
         typer.Option(
-            help="table, air, volume or mixed (70 % anywhere in the volume, else table). Default: its task's, or mixed."
+            help="table, air, volume or mixed (70 % anywhere in the volume, else table); of several objects one, "
+            "which moves one alone. Default: its task's, or mixed."
         ),
     ] = None,
     episodes: Annotated[int, typer.Option(help="Number of random goals.", min=1)] = 300,
@@ -111,6 +112,8 @@ def evaluate(
     world, distance_m = replace(trained, config=config).world, trained.success_distance_m
     tried = trained.on_goals(cast("GoalKind | None", asked))
     of, first_seed = ("", seed) if on is None else (f" of {on.title}", seed + FINAL_SEED)
+    if (num := config.world.num_objects) != (known_num := trained.config.world.num_objects):
+        raise TandemError(f"--set: {trained.label} was trained in a world of {known_num}, not of {num} objects")
     seen, known = (list(layouts(each.world).positions.columns) for each in (config, trained.config))
     if seen != known:
         more = ", ".join(sorted(set(seen) ^ set(known)))
@@ -277,13 +280,14 @@ def film_options(size: str, camera: str, speed: float, out: Path) -> FilmOptions
 
 
 def parse_goals(text: str, world: WorldConfig) -> GoalKind | StateArray:
-    """A kind of random goals, or (N, 3) goals in metres.
+    """A kind of random goals, or (N, 3 K) goals in metres.
 
     Raises:
         TandemError: neither; or a goal outside of the workspace, or inside a fixture.
     """
     import numpy as np
 
+    from service.envs.observations import each_object
     from service.envs.sampling import GOAL_KINDS, check_goals, inside_fixtures
     from service.generator.validity import in_workspace
 
@@ -295,11 +299,12 @@ def parse_goals(text: str, world: WorldConfig) -> GoalKind | StateArray:
         points = np.array([[float(part) for part in point.split(",")] for point in text.strip("; ").split(";")])
     except ValueError:
         points = np.empty(0)
-    if points.shape[1:] != (3,) or not np.isfinite(points).all():
+    if points.shape[1:] != (3 * world.num_objects,) or not np.isfinite(points).all():
+        each = ",".join(["x,y,z"] * world.num_objects)
         raise TandemError(
-            f"--goals {text!r}: write one of {', '.join(GOAL_KINDS)}, or points x,y,z in metres with ; between"
+            f"--goals {text!r}: write one of {', '.join(GOAL_KINDS)}, or points {each} in metres with ; between"
         )
-    for point in points[~in_workspace(points, world.workspace)]:
+    for point in points[~in_workspace(each_object(points), world.workspace).all(axis=1)]:
         low, high = (in_metres(corner) for corner in (world.workspace.lower_m, world.workspace.upper_m))
         raise TandemError(f"--goals: {in_metres(point)} is outside of the workspace, ({low}) to ({high}) m")
     for point in points[inside_fixtures(points, world)]:

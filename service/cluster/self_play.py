@@ -30,7 +30,7 @@ import numpy as np
 import ray
 from ray.exceptions import ObjectLostError, RayError, RayTaskError
 
-from service.actors.evaluation import EVALUATED_GOALS
+from service.actors.evaluation import evaluated_goals
 from service.actors.rollout import MAX_POLICY_LAG, from_arrays
 from service.base.errors import DivergedError
 from service.base.types import Metrics
@@ -146,7 +146,7 @@ class RaySelfPlay(SelfPlay):
     def evaluate(self) -> Metrics:
         """Ask actors for one kind of goals each; the success is in the metrics of a later iteration."""
         alive = [slot for slot in self._pool if slot.alive]
-        for index, kind in enumerate(EVALUATED_GOALS if alive else ()):
+        for index, kind in enumerate(evaluated_goals(self.config.world) if alive else ()):
             alive[index % len(alive)].start_evaluation(self._weights, kind)
         return {}
 

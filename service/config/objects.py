@@ -89,6 +89,10 @@ class ObstacleConfig(ObjectConfig):
     color: Color = (0.90, 0.66, 0.20)
 
 
+COLORS: tuple[Color, ...] = ((0.86, 0.13, 0.11), (0.13, 0.36, 0.78), (0.18, 0.55, 0.27), (0.55, 0.30, 0.65))
+"""Of objects that are only named, by their place: red, blue, green and purple."""
+
+
 def simple_object(name: Literal["cube", "sphere"], size_m: float) -> ObjectConfig:
     """The description of a cube, by its edge, or of a sphere, by its diameter."""
     size = (size_m, size_m, size_m) if name == "cube" else (size_m,)
@@ -115,5 +119,11 @@ Object = Annotated[
     BeforeValidator(_read_mesh),
 ]
 """A name, or a description."""
+ObjectWithMass = Annotated[
+    Annotated[Literal["cube", "sphere"], Tag(NAMED)] | Annotated[ObstacleConfig, Tag(DESCRIBED)],
+    Discriminator(lambda value: NAMED if isinstance(value, str) else DESCRIBED),
+    BeforeValidator(_read_mesh),
+]
+"""The same with its mass and friction."""
 Fixture = Annotated[FixtureConfig, BeforeValidator(_read_mesh)]
 Obstacle = Annotated[ObstacleConfig, BeforeValidator(_read_mesh)]

@@ -18,6 +18,9 @@ class GameConfig(FrozenModel):
     """Asymmetric self-play: who plays how long, for which rewards."""
 
     num_worlds: int = Field(160, ge=1, description="worlds stepped together by one actor")
+    goal_rounds: int = Field(
+        1, ge=1, le=2, description="2: every second goal of a later round leads from the start of the round before"
+    )
     num_goals: int = Field(5, ge=1, description="most rounds from one reset (OpenAI 2021: 5)")
     alice_plays: bool = Field(
         True,
@@ -54,6 +57,9 @@ class GameConfig(FrozenModel):
         le=1.0,
         description="new games may have a blocked gripper while Bob's mean success rate over all goal cells, 0 where "
         "Alice never was, is at least this; below, they keep him from learning to lift",
+    )
+    bob_all_reward: float = Field(
+        0.0, ge=0.0, description="of having all objects at their goals, besides that of each; OpenAI 2021: 5"
     )
     bob_success_reward: float = Field(
         1.0, gt=0.0, description="when the object comes onto the goal; taken back when it leaves (OpenAI 2021)"

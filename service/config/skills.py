@@ -142,4 +142,6 @@ class SkillDiscoveryConfig(Config):
     def _they_see_the_papers_positions(self) -> Self:
         if self.world.observed != ObservedConfig():
             raise ValueError("skill discovery sees the positions of the paper only: leave out world.observed")
+        if self.world.num_objects > 1:
+            raise ValueError("skill discovery moves one object: leave out world.objects")
         return self

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from service.config.frozen import BUILT_IN, DESCRIBED, FrozenModel
-from service.config.objects import Fixture, Object, ObjectConfig, Obstacle, simple_object
+from service.config.objects import COLORS, Fixture, Object, ObjectWithMass, Obstacle, ObstacleConfig, simple_object
 from service.config.recipes import find_file, robots
 from service.config.robot import RobotConfig, read_robot
 
@@ -125,13 +126,19 @@ Robot = Annotated[
 
 
 class WorldConfig(FrozenModel):
-    """The MuJoCo world: robot, table, one rigid object."""
+    """The MuJoCo world: robot, table, rigid objects."""
 
     robot: Robot = Field(
         "panda",
         description="panda, a name of tandem configs, or a YAML file with a description of yours (docs/robots.md)",
     )
     object: Object = Field("cube", description="cube, sphere, or a description: shape, size_m, color (docs/objects.md)")
+    objects: tuple[ObjectWithMass, ...] = Field(
+        (),
+        max_length=len(COLORS),
+        description="in place of object, several that each have a goal: cube, sphere, or a description with mass_kg "
+        "and friction (docs/objects.md)",
+    )
     object_size_m: float = Field(
         0.05, ge=0.02, le=0.07, description="cube edge or sphere diameter; paper: 5 cm. A description has its own"
     )
@@ -162,18 +169,46 @@ class WorldConfig(FrozenModel):
     physics_step_s: float = Field(0.002, gt=0.0, le=0.01)
     num_substeps: int = Field(20, ge=1, le=200, description="physics steps per action; 20 x 2 ms = 25 Hz as panda-gym")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _one_object_is_the_list_of_one(cls, values: Any) -> Any:
+        objects = values.get("objects") if isinstance(values, Mapping) else None
+        if not isinstance(objects, list | tuple) or len(objects) != 1 or values.get("object", "cube") != "cube":
+            return values
+        (only,), rest = objects, {key: value for key, value in values.items() if key != "objects"}
+        if isinstance(only, ObstacleConfig):
+            only = only.model_dump()
+        if not isinstance(only, Mapping):
+            return {**rest, "object": only}
+        apart = {"mass_kg": "object_mass_kg", "friction": "friction"}
+        given = {apart[key]: value for key, value in only.items() if key in apart}
+        return {**rest, **given, "object": {key: value for key, value in only.items() if key not in apart}}
+
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
+        if self.objects and len(self.objects) == 1:
+            raise ValueError("object and objects: a world has the one or the other")
         if self.fixtures and self.fixture != "none":
             raise ValueError(f"fixture = {self.fixture!r} and fixtures: a world has the one or the other")
+        if self.objects and self.object != "cube":
+            raise ValueError(f"object = {self.object!r} and objects: a world has the one or the other")
+        if self.num_objects > 1 and self.fixture != "none":
+            raise ValueError(
+                f"fixture = {self.fixture!r} and {self.num_objects} objects: it is for one; describe it in fixtures"
+            )
         if self.observed.obstacles and not self.obstacles:
             raise ValueError("observed.obstacles, and no obstacles: describe some, or leave it out")
-        if self.rest_height_m >= self.workspace.height_m:
+        if (highest_m := max(self.rest_heights_m)) >= self.workspace.height_m:
             raise ValueError(
-                f"the object's centre lies {self.rest_height_m:g} m high, and the workspace ends at "
+                f"the object's centre lies {highest_m:g} m high, and the workspace ends at "
                 f"{self.workspace.height_m:g} m, so no goal is in it: raise workspace.height_m, or lower the object"
             )
         return self
+
+    @property
+    def num_objects(self) -> int:
+        """K, objects that have goals."""
+        return len(self.objects) or 1
 
     @property
     def num_observed_obstacles(self) -> int:
@@ -191,11 +226,34 @@ class WorldConfig(FrozenModel):
         return max(self.observed.num_commands, (self.randomisation.delay_steps or (0, 0))[1])
 
     @property
-    def shape(self) -> ObjectConfig:
-        """The object's shape and size."""
-        return simple_object(self.object, self.object_size_m) if isinstance(self.object, str) else self.object
+    def bodies(self) -> tuple[ObstacleConfig, ...]:
+        """The K objects that have goals: shape, size, mass and friction of each."""
+        found = []
+        for given, color in zip(self.objects or (self.object,), COLORS, strict=False):
+            shape = simple_object(given, self.object_size_m) if isinstance(given, str) else given
+            if not isinstance(shape, ObstacleConfig):  # named, or the one object, whose mass and friction stand apart
+                shape = ObstacleConfig.model_construct(
+                    shape=shape.shape,
+                    size_m=shape.size_m,
+                    mesh=shape.mesh,
+                    color=color if isinstance(given, str) else shape.color,
+                    mass_kg=self.object_mass_kg,
+                    friction=self.friction,
+                )
+            found.append(shape)
+        return tuple(found)
+
+    @property
+    def shape(self) -> ObstacleConfig:
+        """The first object's shape and size."""
+        return self.bodies[0]
+
+    @property
+    def rest_heights_m(self) -> tuple[float, ...]:
+        """(K,) height of each object's centre as it lies on the table."""
+        return tuple(body.extent_m[2] / 2 for body in self.bodies)
 
     @property
     def rest_height_m(self) -> float:
-        """Height of the object's centre as it lies on the table."""
-        return self.shape.extent_m[2] / 2
+        """Height of the first object's centre as it lies on the table."""
+        return self.rest_heights_m[0]

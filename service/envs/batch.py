@@ -12,13 +12,14 @@ from mujoco import rollout
 from service.base.errors import ConfigError, DivergedError
 from service.base.types import BoolArray, FloatArray, IntArray, StateArray
 from service.config import WorldConfig
-from service.envs.observations import ACTION, COMMAND_PREFIX, Layouts, ObservationLayout, layouts
+from service.envs.objects import object_names
+from service.envs.observations import ACTION, COMMAND_PREFIX, Layouts, ObservationLayout, each_object, layouts
 from service.envs.randomisation import KEYS, ModelBank, normal
 from service.envs.reach import reach_of
 from service.envs.robot import Robot, described
 from service.envs.sampling import Places, draw_starts, gripper_boxes
 from service.envs.scene import FIXTURE_PREFIX, build_layout
-from service.envs.state_layout import OBSTACLE_PREFIX, obstacle_columns, obstacle_places
+from service.envs.state_layout import OBSTACLE_PREFIX, obstacle_columns, places_at, pose_columns
 
 DISPLACEMENT_M = 0.05
 """Way from the end effector to its set-point that a full action asks for (paper); in a step the arm covers a part of
@@ -77,10 +78,13 @@ class WorldBatch:
         self.layout = build_layout(config, blocked_fraction=blocked_fraction)
         """Columns of ``states``."""
         self._commands = self.layout["commands"]
+        self._names = object_names(config)
+        self._objects = pose_columns(self.layout, "object", config.num_objects)
         self._obstacles = obstacle_columns(self.layout, len(config.obstacles))
         self._num_commands = self._commands.stop - self._commands.start
-        # The weights of object and obstacles are actuators, too, the last ones, which ignore their control.
-        assert self.model.nu == self.robot.num_joints + self.robot.num_fingers + 1 + len(config.obstacles)
+        # The weights of objects and obstacles are actuators, too, the last ones, which ignore their control.
+        num_things = config.num_objects + len(config.obstacles)
+        assert self.model.nu == self.robot.num_joints + self.robot.num_fingers + num_things
         assert mujoco.mj_stateSize(self.model, _PHYSICS) == self.layout.physics.stop
         self.blocked_fraction = blocked_fraction
         """Share of later starts with a blocked gripper; more than 0 only where it was when the batch was made."""
@@ -114,8 +118,13 @@ class WorldBatch:
 
     @property
     def object_position(self) -> StateArray:
-        """(N, 3) object centre, metres."""
-        return self.states[:, self.layout["object"]]
+        """(N, 3 K) centres of the objects, one after the other, metres."""
+        return self._of_objects("object")
+
+    @property
+    def object_velocity(self) -> StateArray:
+        """(N, 3 K) velocities of the objects, m/s."""
+        return self._of_objects("object_velocity")
 
     @property
     def box_place(self) -> StateArray:
@@ -124,8 +133,8 @@ class WorldBatch:
 
     @property
     def obstacle_positions(self) -> StateArray:
-        """(N, K, 3) centres of the obstacles, metres."""
-        return obstacle_places(self.states, self._obstacles)
+        """(N, M, 3) centres of the M obstacles, metres."""
+        return places_at(self.states, self._obstacles)
 
     @property
     def places(self) -> Places:
@@ -151,9 +160,11 @@ class WorldBatch:
         """
         states = np.tile(self._fresh_state, (num, 1))
         places = draw_starts(rng, num, self.bank.largest, self._gripper_at_start)
-        places.object[:, 2] += self.config.rest_height_m - self.bank.largest.rest_height_m
-        states[:, self.layout["object"]], states[:, self.layout["box_place"]] = places.object, places.box
-        obstacle_places(states, self._obstacles)[:] = places.obstacles
+        smaller_m = np.subtract(self.config.rest_heights_m, self.bank.largest.rest_heights_m)
+        places_at(states, self._objects)[:] = each_object(places.object)
+        places_at(states, self._objects)[:, :, 2] += smaller_m
+        states[:, self.layout["box_place"]] = places.box
+        places_at(states, self._obstacles)[:] = places.obstacles
         self._draw_physics(rng, states)
         if self.blocked_fraction:
             blocked = rng.random(num) < self.blocked_fraction
@@ -167,17 +178,18 @@ class WorldBatch:
         if drawn.model_ranges:
             model = rng.integers(len(self.bank), size=num)
             states[:, layout["model"]] = model[:, None]
-            states[:, layout["object"].start + 2] += self.bank.rest_height_m[model] - self.config.rest_height_m
-            obstacle_places(states, self._obstacles)[:, :, 2] += self.bank.table_height_m[model][:, None]
+            places_at(states, self._objects)[:, :, 2] += self.bank.rest_height_m[model] - self.config.rest_heights_m
+            places_at(states, self._obstacles)[:, :, 2] += self.bank.table_height_m[model][:, None]
             if self.config.fixture == "box":
                 states[:, layout["box_place"].start + 2] += self.bank.table_height_m[model]
         if drawn.delay_steps is not None:
             low, high = drawn.delay_steps
             states[:, layout["delay"]] = rng.integers(low, high + 1, (num, 1))
         if drawn.object_offset_m is not None:
-            direction = rng.normal(size=(num, 3))
-            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-            states[:, layout["object_offset"]] = direction * rng.uniform(*drawn.object_offset_m, (num, 1))
+            direction = rng.normal(size=(num, self.config.num_objects, 3))
+            direction /= np.linalg.norm(direction, axis=2, keepdims=True)
+            direction *= rng.uniform(*drawn.object_offset_m, (num, self.config.num_objects, 1))
+            states[:, layout["object_offset"]] = direction.reshape(num, 3 * self.config.num_objects)
         if drawn.object_noise_m is not None:
             std, key = rng.uniform(*drawn.object_noise_m, num), rng.integers(KEYS, size=num)
             states[:, layout["object_noise"]] = np.column_stack((std, key))
@@ -274,17 +286,17 @@ class WorldBatch:
     def true_positions(self, seen: Layouts) -> FloatArray:
         """(N, P) positions of any layouts without the errors of ``config.randomisation``."""
         place = self.object_position
-        return self.observe(seen.positions, object=place, object_from_effector=place - self.ee_position)
+        return self.observe(seen.positions, object=place, object_from_effector=self._from_effector(place))
 
     def full(self, elapsed: float) -> FloatArray:
         """(N, F) input of Alice: ``Layouts.full``; ``elapsed`` is the share of her turn gone by, in [0, 1]."""
         return self.observe(self.observed.full, elapsed=elapsed)
 
     def bob_value(self, goal: StateArray) -> FloatArray:
-        """(N, V) input of Bob's value network, ``Layouts.bob_value``, for (N, 3) goals, metres; without errors."""
+        """(N, V) input of Bob's value network, ``Layouts.bob_value``, for (N, 3 K) goals, metres; without errors."""
         place = self.object_position
         given = {"goal": goal, "object": place, "goal_from_object": goal - place}
-        return self.observe(self.observed.bob_value, object_from_effector=place - self.ee_position, **given)
+        return self.observe(self.observed.bob_value, object_from_effector=self._from_effector(place), **given)
 
     def observe(self, layout: ObservationLayout, **given: StateArray | float) -> FloatArray:
         """(N, O) vectors of any layout; ``given`` are the (N, size) entries a world does not know, such as a goal."""
@@ -311,7 +323,9 @@ class WorldBatch:
         if name == "object":
             return self._seen_object
         if name == "object_from_effector":
-            return self._seen_object - self.ee_position
+            return self._from_effector(self._seen_object)
+        if name == "object_velocity":
+            return self.object_velocity
         if name == "effector_velocity":
             velocity = self.states[:, self.layout["joint_velocities"]]
             linear: StateArray = np.matmul(self._kinematics.jacobian[:, :3], velocity[:, :, None])[:, :, 0]
@@ -327,11 +341,20 @@ class WorldBatch:
         if drawn.object_noise_m is not None:
             std, key = self.states[:, self.layout["object_noise"]].T
             steps = np.rint(self.states[:, 0] / (self.config.physics_step_s * self.config.num_substeps))
-            self._seen_object = self._seen_object + std[:, None] * normal(key, steps, 3)
+            self._seen_object = self._seen_object + std[:, None] * normal(key, steps, 3 * self.config.num_objects)
 
     def contacts(self) -> BoolArray:
-        """(N, 2) left, right finger touched the object during the last action."""
+        """(N, 2 K) left, right finger touched each object during the last action."""
         return self.states[:, self.layout["contacts"]] > 0
+
+    def _of_objects(self, name: str) -> StateArray:
+        """(N, 3 K) a part of the state that each object has; of one object a view."""
+        parts = [self.states[:, self.layout[name.replace("object", each, 1)]] for each in self._names]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+
+    def _from_effector(self, place: StateArray) -> StateArray:
+        """(N, 3 K) ways from the end effector to (N, 3 K) places."""
+        return place - np.tile(self.ee_position, self.config.num_objects)
 
     def _make_fresh_state(self) -> StateArray:
         workspace = self.config.workspace
@@ -344,10 +367,11 @@ class WorldBatch:
         self._check_start(state)
         # Where there is no room, it is said now.
         places = draw_starts(np.random.default_rng(0), _NUM_TRIED_STARTS, self.bank.largest, self._gripper_at_start)
-        if self.config.obstacles:  # before the first reset, too, nothing is inside another
-            state[self.layout["object"]], state[self.layout["box_place"]] = places.object[0], places.box[0]
-            state[self.layout["object"].start + 2] = self.config.rest_height_m
-            obstacle_places(state[None], self._obstacles)[:] = places.obstacles[:1]
+        if self.config.obstacles or self.config.objects:  # before the first reset, too, nothing is inside another
+            state[self.layout["box_place"]] = places.box[0]
+            places_at(state[None], self._objects)[:] = each_object(places.object[:1])
+            places_at(state[None], self._objects)[:, :, 2] = self.config.rest_heights_m
+            places_at(state[None], self._obstacles)[:] = places.obstacles[:1]
         return state
 
     def _check_start(self, state: StateArray) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from itertools import product
 from typing import Any
 
 import mujoco
@@ -45,16 +46,24 @@ def grip(geom: mujoco.MjsGeom, friction: float) -> None:
     geom.priority = _GRIPPER_PRIORITY  # these parameters, not a mixture with the object's
 
 
-def add_finger_sensors(spec: mujoco.MjSpec, fingers: Iterable[str]) -> None:
-    """Sensors of whether each finger, a body with all that hangs on it, touches the object: above 0 where it does."""
-    for finger in fingers:
+def object_names(config: WorldConfig) -> list[str]:
+    """Names of the bodies of the objects that have goals."""
+    return ["object", *(f"object_{number}" for number in range(2, config.num_objects + 1))]
+
+
+def add_finger_sensors(spec: mujoco.MjSpec, fingers: Sequence[str], objects: Iterable[str]) -> None:
+    """Sensors of whether each finger, a body with all that hangs on it, touches an object: above 0 where it does.
+
+    In the order of the objects, and of each in that of the fingers.
+    """
+    for name, finger in product(objects, fingers):
         sensor = spec.add_sensor(
-            name=f"{finger}_contact",
+            name=f"{finger}_contact_{name}",
             type=mujoco.mjtSensor.mjSENS_CONTACT,
             objtype=mujoco.mjtObj.mjOBJ_XBODY,
             objname=finger,
             reftype=mujoco.mjtObj.mjOBJ_BODY,
-            refname="object",
+            refname=name,
         )
         sensor.intprm[:3] = (1, 0, 1)  # data bits (1: "found"), reduction (0: none), slots (1)
 
@@ -84,13 +93,15 @@ def parts_of(spec: mujoco.MjSpec, shape: ObjectConfig, name: str, mass_kg: float
 
 
 def add_things(spec: mujoco.MjSpec, config: WorldConfig) -> None:
-    """Add the object that players move, and obstacles: a game goes on when one of these falls onto the floor.
+    """Add the objects that players move, and obstacles: a game goes on when one of these falls onto the floor.
 
     The gripper touches them, and they touch table, fixtures and each other. An obstacle's friction counts wherever it
     lies, not the greater one of it and the table's, as without a priority.
     """
-    touching = {"contype": OBJECT_BIT, "conaffinity": GRIPPER_BIT}
-    _add_free(spec, config.shape, "object", config.object_mass_kg, config.friction, touching)
+    each_other = OBJECT_BIT if config.num_objects > 1 else 0
+    touching = {"contype": OBJECT_BIT, "conaffinity": GRIPPER_BIT | each_other}
+    for name, body in zip(object_names(config), config.bodies, strict=True):
+        _add_free(spec, body, name, body.mass_kg, body.friction, touching)
     touching = {
         "contype": OBJECT_BIT,
         "conaffinity": GRIPPER_BIT | OBJECT_BIT | FLOOR_BIT,

@@ -11,9 +11,9 @@ which is a signed permutation of each vector.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +74,17 @@ class Entry:
     """Subtracted to normalise; one number for all, or one each."""
     scale: float
     """Divided by to normalise."""
+    of_each_object: bool = False
+    """Whether it has as many numbers for each object, one object after the other."""
+
+    def of(self, num_objects: int) -> Entry:
+        """The same in a world of so many objects."""
+        if not self.of_each_object or num_objects == 1:
+            return self
+        size, many = len(self.kind.source), range(num_objects)
+        source = tuple(size * number + index for number in many for index in self.kind.source)
+        offset = self.offset if isinstance(self.offset, float) else self.offset * num_objects
+        return replace(self, kind=Kind(source, self.kind.sign * num_objects), offset=offset)
 
 
 class ObservationLayout:
@@ -90,6 +101,10 @@ class ObservationLayout:
         """These entries, then those of ``other``."""
         return ObservationLayout(*self.entries, *other.entries)
 
+    def of(self, num_objects: int) -> ObservationLayout:
+        """The same in a world of so many objects."""
+        return ObservationLayout(*(entry.of(num_objects) for entry in self.entries))
+
     def without(self, name: str) -> ObservationLayout:
         """The others, in their order."""
         return ObservationLayout(*(entry for entry in self.entries if entry.name != name))
@@ -104,6 +119,15 @@ class ObservationLayout:
         source = [self[entry.name].start + np.array(entry.kind.source) for entry in self.entries]
         sign = [entry.kind.sign for entry in self.entries]
         return Mirror(np.concatenate(source), np.concatenate(sign).astype(np.float32))
+
+    def exchange(self, one: int, other: int, num_objects: int) -> Mirror:
+        """Exchange of two objects in a vector, which is a permutation as a reflection is one."""
+        source = np.arange(self.size)
+        for entry in self.entries:
+            if entry.of_each_object:
+                columns = source[self[entry.name]].reshape(num_objects, -1)  # a view
+                columns[[one, other]] = columns[[other, one]]
+        return Mirror(source, np.ones(self.size, dtype=np.float32))
 
     @cached_property
     def normalisation(self) -> Normalisation:
@@ -124,19 +148,19 @@ ACTION = ObservationLayout(
 POSITIONS = ObservationLayout(
     Entry("effector", VECTOR, "m", _MIDDLE_M, 0.12),
     Entry("fingers", PAIR, "m", 0.02, 0.02),
-    Entry("object", VECTOR, "m", _MIDDLE_M, 0.12),
-    Entry("object_from_effector", VECTOR, "m", 0.0, 0.1),
+    Entry("object", VECTOR, "m", _MIDDLE_M, 0.12, of_each_object=True),
+    Entry("object_from_effector", VECTOR, "m", 0.0, 0.1, of_each_object=True),
 )
-"""Input of Bob's primitives in the paper, and the first entries of theirs in every world."""
+"""Input of Bob's primitives in the paper, and the first entries of theirs in every world, there for each object."""
 _MOTION = ObservationLayout(
     Entry("effector_velocity", VECTOR, "m/s", 0.0, 0.5),
     Entry("finger_velocities", PAIR, "m/s", 0.0, 0.2),
-    Entry("object_velocity", VECTOR, "m/s", 0.0, 0.5),
-    Entry("contacts", PAIR, "0 or 1", 0.5, 0.5),
+    Entry("object_velocity", VECTOR, "m/s", 0.0, 0.5, of_each_object=True),
+    Entry("contacts", PAIR, "0 or 1", 0.5, 0.5, of_each_object=True),
 )
-_GOAL = ObservationLayout(Entry("goal", VECTOR, "m", _MIDDLE_M, 0.12))
-GOAL_FROM_OBJECT = ObservationLayout(Entry("goal_from_object", VECTOR, "m", 0.0, 0.1))
-"""Way that the object has to go."""
+_GOAL = ObservationLayout(Entry("goal", VECTOR, "m", _MIDDLE_M, 0.12, of_each_object=True))
+GOAL_FROM_OBJECT = ObservationLayout(Entry("goal_from_object", VECTOR, "m", 0.0, 0.1, of_each_object=True))
+"""Way that each object has to go."""
 _ELAPSED = ObservationLayout(Entry("elapsed", SCALAR, "share of the turn", 0.5, 0.5))
 DELAY = "delay"
 """Name of the entry that says how late commands are."""
@@ -148,15 +172,21 @@ COMMAND_PREFIX = "command_"
 class Layouts:
     """Layouts of everything that is observed in a world.
 
-    Entries that a world has beyond the paper's follow ``POSITIONS``, so slices of ``POSITIONS`` hold in all.
+    Entries that a world has beyond the paper's follow ``POSITIONS``, so slices of ``POSITIONS`` hold in all of one
+    object.
 
     Args:
         num_commands: last commands that policies see.
         num_obstacles: obstacles whose positions they see.
         delay: whether they see how late commands are.
+        num_objects: K.
     """
 
-    def __init__(self, num_commands: int = 0, num_obstacles: int = 0, *, delay: bool = False) -> None:
+    def __init__(
+        self, num_commands: int = 0, num_obstacles: int = 0, *, delay: bool = False, num_objects: int = 1
+    ) -> None:
+        motion, goal, self.way = (each.of(num_objects) for each in (_MOTION, _GOAL, GOAL_FROM_OBJECT))
+        self.num_objects = num_objects
         obstacles = (
             Entry(f"{OBSTACLE_PREFIX}{number + 1}", VECTOR, "m", _MIDDLE_M, 0.12) for number in range(num_obstacles)
         )
@@ -164,15 +194,16 @@ class Layouts:
             Entry(f"{COMMAND_PREFIX}{age + 1}", COMMAND, "share of the greatest", 0.0, 1.0)
             for age in range(num_commands)
         )
-        self.positions = POSITIONS + ObservationLayout(*obstacles, *commands, *([_DELAY] if delay else []))
+        further = ObservationLayout(*obstacles, *commands, *([_DELAY] if delay else []))
+        self.positions = POSITIONS.of(num_objects) + further
         """Input of Bob's primitives."""
-        self.full = self.positions + _MOTION + _ELAPSED
+        self.full = self.positions + motion + _ELAPSED
         """Input of Alice's policy and of her value network."""
-        self.bob = self.positions + _GOAL
+        self.bob = self.positions + goal
         """Input of Bob's policy."""
-        self.bob_value = self.positions + _MOTION + _GOAL + GOAL_FROM_OBJECT
+        self.bob_value = self.positions + motion + goal + self.way
         """Input of Bob's value network."""
-        self.gate = self.bob + GOAL_FROM_OBJECT
+        self.gate = self.bob + self.way
         """Input of Bob's gate: his observation and what follows from it."""
 
     @property
@@ -184,7 +215,10 @@ class Layouts:
 
 def layouts(world: WorldConfig) -> Layouts:
     """Layouts of worlds of a configuration."""
-    return Layouts(world.observed.num_commands, world.num_observed_obstacles, delay=world.observed.delay)
+    observed = world.observed
+    return Layouts(
+        observed.num_commands, world.num_observed_obstacles, delay=observed.delay, num_objects=world.num_objects
+    )
 
 
 PAPER = Layouts()
@@ -192,6 +226,17 @@ PAPER = Layouts()
 FULL, BOB, BOB_VALUE, GATE, SPACES = PAPER.full, PAPER.bob, PAPER.bob_value, PAPER.gate, PAPER.spaces
 
 
+def each_object(rows: NDArray[Any]) -> NDArray[Any]:
+    """(..., K, 3) places of K objects, which (..., 3 K) rows have one after the other; a view."""
+    return rows.reshape(*rows.shape[:-1], rows.shape[-1] // 3, 3)
+
+
+def distances(places: NDArray[Any], others: NDArray[Any]) -> NDArray[np.float64]:
+    """(N, K) distances of each object's place of (N, 3 K) from that of others."""
+    found: NDArray[np.float64] = np.linalg.norm(each_object(places - others), axis=-1)
+    return found
+
+
 def bob_observation(positions: FloatArray, goal: NDArray[np.floating]) -> FloatArray:
-    """Bob's input (N, P + 3) from (N, P) positions and (N, 3) goals, metres."""
+    """Bob's input (N, P + 3 K) from (N, P) positions and (N, 3 K) goals, metres."""
     return np.concatenate([positions, goal.astype(np.float32)], axis=1)

@@ -12,6 +12,7 @@ import numpy as np
 
 from service.base.types import Array, StateArray
 from service.config import WorldConfig
+from service.config.objects import ObstacleConfig
 from service.envs.robot import described
 from service.envs.scene import FIXTURE_PREFIX, build_model
 
@@ -45,8 +46,8 @@ class ModelBank:
         """M of them."""
         self.table_height_m: StateArray = self.drawn.get("table_height_m", np.zeros(num))
         """(M,) above where the configuration has it."""
-        self.rest_height_m: StateArray = self.table_height_m + [variant.rest_height_m for variant in variants]
-        """(M,) height of the object's centre as it lies on the table."""
+        self.rest_height_m: StateArray = self.table_height_m[:, None] + [each.rest_heights_m for each in variants]
+        """(M, K) height of each object's centre as it lies on the table."""
 
     def __len__(self) -> int:
         return len(self.models)
@@ -65,16 +66,29 @@ def _spread(ranges: dict[str, tuple[float, float]], num: int) -> dict[str, State
 
 def _variant(config: WorldConfig, drawn: dict[str, float]) -> WorldConfig:
     """The world with an object as drawn."""
-    changed: dict[str, object] = {name: drawn[name] for name in ("object_mass_kg", "friction") if name in drawn}
-    if (factor := drawn.get("object_size")) is not None:
-        shape = config.shape
-        size, mesh = tuple(factor * each for each in shape.size_m), shape.mesh
-        if mesh is not None:
-            center = tuple(factor * each for each in mesh.center_m)
-            of_size = {"scale": mesh.scale * factor, "center_m": center, "volume_m3": mesh.volume_m3 * factor**3}
-            mesh = mesh.model_copy(update=of_size)
-        changed["object"] = shape.model_copy(update={"size_m": size, "mesh": mesh})
+    same = {"object_mass_kg": "mass_kg", "friction": "friction"}
+    changed: dict[str, object] = {name: drawn[name] for name in same if name in drawn}
+    alike, factor = {same[name]: value for name, value in changed.items()}, drawn.get("object_size", 1.0)
+    given = config.objects or (config.object,)
+    bodies = tuple(
+        _scaled(body, factor).model_copy(update=alike if isinstance(each, str) or not config.objects else {})
+        for each, body in zip(given, config.bodies, strict=True)  # a description keeps its own mass and friction
+    )
+    if config.objects:
+        changed["objects"] = bodies
+    elif "object_size" in drawn:
+        changed["object"] = bodies[0]
     return config.model_copy(update=changed)
+
+
+def _scaled(body: ObstacleConfig, factor: float) -> ObstacleConfig:
+    """An object of so many times the size."""
+    size, mesh = tuple(factor * each for each in body.size_m), body.mesh
+    if mesh is not None:
+        center = tuple(factor * each for each in mesh.center_m)
+        of_size = {"scale": mesh.scale * factor, "center_m": center, "volume_m3": mesh.volume_m3 * factor**3}
+        mesh = mesh.model_copy(update=of_size)
+    return body.model_copy(update={"size_m": size, "mesh": mesh})
 
 
 def _compile(config: WorldConfig, drawn: dict[str, float]) -> mujoco.MjModel:

@@ -17,7 +17,7 @@ from service.config.model_files import model_file
 from service.config.robot import Numbers, PadConfig, RobotConfig
 from service.envs import panda
 from service.envs.kinematics import Chain
-from service.envs.objects import GRIPPER_BIT, add_finger_sensors, grip, slide
+from service.envs.objects import GRIPPER_BIT, add_finger_sensors, grip, object_names, slide
 
 _PREFIX, _HAND_PREFIX = "robot/", "hand/"
 """Begin the names of all that comes from a file, so that none is that of something in the scene; a hand's has both."""
@@ -61,7 +61,7 @@ def add_robot(spec: mujoco.MjSpec, config: WorldConfig) -> None:
             _add_servo(spec, joint, *(_number(getattr(robot, name), index) for name in names))
     if config.robot != "panda":
         _let_touch(spec, robot, [joint.parent for joint in fingers], config.pad_friction)
-    add_finger_sensors(spec, [joint.parent.name for joint in fingers])
+    add_finger_sensors(spec, [joint.parent.name for joint in fingers], object_names(config))
 
 
 class Robot:
@@ -111,9 +111,9 @@ class Robot:
         return values
 
     def contacts(self, touches: BoolArray) -> BoolArray:
-        """(N, 2) whether a left and a right finger touches, for (N, F) fingers that do."""
-        sides: BoolArray = np.matmul(touches, self._sides)
-        return sides
+        """(N, 2 K) whether a left and a right finger touches each object, for (N, K F) fingers that do."""
+        sides: BoolArray = np.matmul(touches.reshape(len(touches), -1, self.num_fingers), self._sides)
+        return sides.reshape(len(touches), -1)
 
 
 def _add_from_files(spec: mujoco.MjSpec, robot: RobotConfig) -> None:
@@ -216,7 +216,7 @@ def _check_joints(
 def _check_effector(spec: mujoco.MjSpec, robot: RobotConfig, config: WorldConfig) -> None:
     frame = _prefix(robot) + robot.effector.frame
     _there(spec.site(frame) or spec.body(frame), robot, f"site or body {robot.effector.frame!r}, the effector's frame,")
-    width_m = config.shape.extent_m[1]
+    width_m = max(body.extent_m[1] for body in config.bodies)
     if config.gripper == "free" and width_m >= robot.opening_m:
         raise ConfigError(
             f"robot {robot.name}: its gripper opens to {robot.opening_m:g} m, and along y the object is {width_m:g} m "

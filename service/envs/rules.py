@@ -11,6 +11,7 @@ from service.base.types import Array, BoolArray, StateArray
 from service.base.user_code import CodeError, checked, naming_errors_of, place_of
 from service.config.run import SUCCESS_DISTANCE_M
 from service.envs.batch import WorldBatch
+from service.envs.observations import distances, each_object
 from service.envs.sampling import GoalKind, check_goals, draw_goals, inside_fixtures, inside_obstacles
 from service.envs.task import Bodies, Task, View
 
@@ -52,11 +53,12 @@ class Rules:
         """(N, M)"""
 
     def view(self, goal: StateArray) -> View:
-        """What its functions see now, for (N, 3) goals, metres."""
+        """What its functions see now, for (N, 3 K) goals, metres."""
         worlds, layout = self._worlds, self._worlds.layout
-        objects = worlds.object_position[:, None], worlds.states[:, None, layout["object_velocity"]]
+        objects = each_object(worlds.object_position), each_object(worlds.object_velocity)
         fingers = worlds.robot.openings(worlds.states[:, layout["fingers"]]).sum(axis=1)
-        parts = worlds.ee_position, fingers, worlds.contacts()[:, None], goal[:, None], self.elapsed, self.memory
+        contacts = worlds.contacts().reshape(worlds.num_worlds, -1, 2)
+        parts = worlds.ee_position, fingers, contacts, each_object(goal), self.elapsed, self.memory
         return View(Bodies(*map(_shown, objects)), *map(_shown, parts))
 
     def begin(self, worlds: BoolArray) -> None:
@@ -64,7 +66,7 @@ class Rules:
         self.elapsed[worlds], self.memory[worlds] = 0, 0.0
 
     def draw(self, rng: np.random.Generator, worlds: slice = _ALL) -> StateArray:
-        """(N, 3) goals for some worlds, metres.
+        """(N, 3 K) goals for some worlds, metres.
 
         Those of a function are drawn again where they are out of reach, or inside something.
 
@@ -79,7 +81,8 @@ class Rules:
         goal, wrong = np.empty_like(places.object), np.ones(len(places.object), dtype=bool)
         for _ in range(_MAX_DRAWS):
             asked = view.of(wrong)
-            goal[wrong] = self._asked("goals", asked.objects.place.shape, asked, rng)[:, 0]
+            found = self._asked("goals", asked.objects.place.shape, asked, rng)
+            goal[wrong] = found.reshape(len(found), -1)
             wrong = self.out_of_reach(goal) | inside_fixtures(goal, config)
             wrong |= inside_obstacles(goal, places.obstacles, config)
             if not wrong.any():
@@ -93,14 +96,15 @@ class Rules:
             self.memory = self._asked("remember", self.memory.shape, self.view(goal))
 
     def solved(self, goal: StateArray) -> BoolArray:
-        """(N,) whether the worlds are as the task asks, for (N, 3) goals, metres."""
+        """(N,) whether the worlds are as the task asks, for (N, 3 K) goals, metres."""
         return self.success(self.view(goal))
 
     def success(self, view: View) -> BoolArray:
-        """(N,) whether the task's function says so; without one, whether the object is near its goal."""
+        """(N,) whether the task's function says so; without one, whether each object is near its goal."""
         if self.task.success is None:
-            near: BoolArray = np.linalg.norm(view.objects.place[:, 0] - view.goal[:, 0], axis=1) <= self._near_m
-            return near
+            near: BoolArray = np.linalg.norm(view.objects.place - view.goal, axis=2) <= self._near_m
+            all_near: BoolArray = np.all(near, axis=1)
+            return all_near
         found: BoolArray = self._asked("success", view.objects.place.shape[:1], view, truth=True)
         return found
 
@@ -112,15 +116,16 @@ class Rules:
         return paid
 
     def nearest(self, goal: StateArray) -> StateArray:
-        """(N, 3) where the object can be brought, nearest to (N, 3); on the table it may be lower than the arm."""
-        raised = np.maximum(goal, [-np.inf, -np.inf, self._worlds.config.rest_height_m])
+        """(N, 3 K) where objects can be brought, nearest to (N, 3 K); on the table it may be lower than the arm."""
+        rest = [(-np.inf, -np.inf, height) for height in self._worlds.config.rest_heights_m]
+        raised = np.maximum(each_object(goal), rest).reshape(-1, 3)
         reached = self._worlds.reach.clip(raised)
         reached[:, 2] = np.minimum(raised[:, 2], self._worlds.reach.height[-1])
-        return reached
+        return reached.reshape(goal.shape)
 
     def out_of_reach(self, goal: StateArray) -> BoolArray:
-        """(N,) whether the arm brings nothing as near to (N, 3) goals as counts."""
-        near: BoolArray = np.linalg.norm(self.nearest(goal) - goal, axis=1) <= self._near_m
+        """(N,) whether the arm brings an object not as near to its place of (N, 3 K) goals as counts."""
+        near: BoolArray = np.all(distances(self.nearest(goal), goal) <= self._near_m, axis=1)
         return ~near  # what is no number is out of reach, too
 
     def _asked(self, name: str, shape: tuple[int, ...], *given: Any, truth: bool = False) -> Array:

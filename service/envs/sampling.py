@@ -19,9 +19,11 @@ from service.config import WorkspaceConfig, WorldConfig
 from service.config.objects import FixtureConfig, ObjectConfig
 from service.envs import scene
 from service.envs.objects import GRIPPER_BIT
+from service.envs.observations import each_object
 
-GoalKind = Literal["table", "air", "mixed", "volume"]
-GOAL_KINDS: tuple[GoalKind, ...] = ("table", "air", "mixed", "volume")
+GoalKind = Literal["table", "air", "mixed", "volume", "one"]
+TABLE: GoalKind = "table"
+GOAL_KINDS: tuple[GoalKind, ...] = (TABLE, "air", "mixed", "volume", "one")
 MIXED_AIR_SHARE = 0.7
 """Share of mixed goals drawn anywhere in the workspace's volume; the rest lie on the table (paper: p = 0.7)."""
 _NUM_DRAWS = 20
@@ -37,11 +39,11 @@ class Places(NamedTuple):
     """Where things are in N worlds, metres."""
 
     object: StateArray
-    """(N, 3) its centre."""
+    """(N, 3 K) centres of the objects, one after the other."""
     box: StateArray
     """(N, 3) the middle of its bottom; (N, 0) in worlds without."""
     obstacles: StateArray
-    """(N, K, 3) their centres; (N, 0, 3) where they are not known."""
+    """(N, M, 3) their centres; (N, 0, 3) where they are not known."""
 
     def of(self, worlds: slice | BoolArray | NDArray[np.intp]) -> Places:
         """Those of some worlds."""
@@ -71,7 +73,7 @@ def sample_on_table(
 
 
 def draw_objects(rng: np.random.Generator, num: int, config: WorldConfig) -> Places:
-    """Random starts of objects, and of the box where there is one; obstacles are left out.
+    """Random starts of the first object, and of the box where there is one; all else is left out.
 
     Without a fixture, anywhere on the table inside the workspace; so far from fixtures that are described that an open
     finger fits between. Beside a wall, in one of its two areas, either with equal chance. With a box, the box's middle
@@ -80,7 +82,7 @@ def draw_objects(rng: np.random.Generator, num: int, config: WorldConfig) -> Pla
     box, no_obstacles = np.empty((num, 0)), np.empty((num, 0, 3))
     if config.fixture == "wall":
         return Places(_beside_wall(rng, rng.choice((-1.0, 1.0), num), config), box, no_obstacles)
-    position = _clear_of_fixtures(lambda num: _on_table(rng, num, config), num, config, _BESIDE_OBJECT_M)
+    position = _clear_of_fixtures(lambda num: _on_table(rng, num, config), num, config, _BESIDE_OBJECT_M, config.shape)
     if config.fixture == "box":
         box = position * (1.0, 1.0, 0.0)
         position = _outside_boxes(rng, box, config)
@@ -88,68 +90,82 @@ def draw_objects(rng: np.random.Generator, num: int, config: WorldConfig) -> Pla
 
 
 def draw_starts(rng: np.random.Generator, num: int, config: WorldConfig, gripper: Boxes) -> Places:
-    """Random places of what starts elsewhere in every game: see ``draw_objects`` for object and box.
+    """Random places of what starts elsewhere in every game: see ``draw_objects`` for the first object and the box.
 
-    Obstacles lie on the table with their centres inside the workspace, clear of fixtures, the box, the gripper and each
-    other, and so far from the object that an open finger fits between. Where some find no place, object and box are
-    drawn anew, too.
+    The other objects and obstacles lie on the table with their centres inside the workspace, clear of fixtures, the
+    box, the gripper and each other, and so far from objects that an open finger fits between. Where some find no place,
+    the first object and the box are drawn anew, too.
 
     Raises:
         ConfigError: there is no room.
     """
-    places = draw_objects(rng, num, config)._replace(obstacles=np.empty((num, len(config.obstacles), 3)))
-    standing = _join(_around_fixtures(config), gripper)
+    others = (*config.bodies[1:], *config.obstacles)
+    first, box, _ = draw_objects(rng, num, config)
+    standing, beside = _join(_around_fixtures(config), gripper), np.empty((num, len(others), 3))
     left = np.arange(num)
     for _ in range(_NUM_ARRANGEMENTS):
-        here = places.of(left)
-        clear = ~_overlap(_around(here.object, config.shape), gripper)
-        if config.obstacles:
-            clear &= _place_obstacles(rng, here, config, standing)
-            places.obstacles[left] = here.obstacles
+        clear = ~_overlap(_around(first[left], config.shape), gripper)
+        if others:
+            beside[left], found_place = _place_others(rng, first[left], box[left], others, config, standing)
+            clear &= found_place
         left = left[~clear]
         if not left.size:
-            return places
-        places.object[left], places.box[left], _ = draw_objects(rng, left.size, config)
-    if not config.obstacles:
+            further = beside[:, : config.num_objects - 1].reshape(num, 3 * (config.num_objects - 1))
+            return Places(np.concatenate([first, further], axis=1), box, beside[:, config.num_objects - 1 :])
+        first[left], box[left], _ = draw_objects(rng, left.size, config)
+    if not others:
         raise ConfigError(
             f"world.object is {config.shape.extent_m[2]:g} m high and starts inside the gripper, wherever it is put: "
             f"raise world.start_height_m, which is {config.start_height_m:g}"
         )
+    name = "obstacles" if config.num_objects == 1 else "objects"
     raise ConfigError(
-        f"world.obstacles: no room in the workspace for the {len(config.obstacles)} of them beside the object, each "
-        "other, fixtures and the gripper: leave some out, make them smaller, or make world.workspace larger"
+        f"world.{name}: no room in the workspace for the {len(others)} of them beside the first object, each other, "
+        "fixtures and the gripper: leave some out, make them smaller, or make world.workspace larger"
     )
 
 
-def _place_obstacles(rng: np.random.Generator, places: Places, config: WorldConfig, standing: Boxes) -> BoolArray:
-    """Draw ``places.obstacles``; (N,) worlds where all are clear."""
-    num = len(places.object)
-    own = _around(places.object, config.shape)
-    taken = [Boxes(own.lower - _BESIDE_OBJECT_M + scene.GAP_M, own.upper + _BESIDE_OBJECT_M - scene.GAP_M)]
-    if places.box.size:
+def _place_others(
+    rng: np.random.Generator,
+    first: StateArray,
+    box: StateArray,
+    others: Sequence[ObjectConfig],
+    config: WorldConfig,
+    standing: Boxes,
+) -> tuple[StateArray, BoolArray]:
+    """(N, M, 3) random places of all things but the first object and the box; (N,) worlds where all are clear."""
+    num = len(first)
+    places, all_clear = np.empty((num, len(others), 3)), np.ones(num, dtype=bool)
+    taken = [_beside(_around(first, config.shape))]
+    if box.size:
         half = np.array([scene.BOX_SIZE_M / 2, scene.BOX_SIZE_M / 2, 0.0])
-        taken.append(Boxes(places.box - half, places.box + half + [0.0, 0.0, scene.BOX_HEIGHT_M]))
-    all_clear = np.ones(num, dtype=bool)
-    for index, obstacle in enumerate(config.obstacles):
-        others = Boxes(np.stack([each.lower for each in taken], 1), np.stack([each.upper for each in taken], 1))
+        taken.append(Boxes(box - half, box + half + [0.0, 0.0, scene.BOX_HEIGHT_M]))
+    for index, thing in enumerate(others):
+        lying = Boxes(np.stack([each.lower for each in taken], 1), np.stack([each.upper for each in taken], 1))
         here = np.empty((num, 3))
         blocked = np.ones(num, dtype=bool)
         for _ in range(_NUM_DRAWS):
-            here[blocked] = sample_on_table(rng, int(blocked.sum()), config.workspace, obstacle.extent_m[2])
-            around = _around(here, obstacle)
+            here[blocked] = sample_on_table(rng, int(blocked.sum()), config.workspace, thing.extent_m[2])
+            around = _around(here, thing)
             beside = Boxes(around.lower - scene.GAP_M, around.upper + scene.GAP_M)
-            blocked = _overlap(beside, standing) | _overlap(beside, others)
+            blocked = _overlap(beside, standing) | _overlap(beside, lying)
             if not blocked.any():
                 break
         all_clear &= ~blocked
-        places.obstacles[:, index] = here
-        taken.append(_around(here, obstacle))
-    return all_clear
+        places[:, index] = here
+        around = _around(here, thing)
+        taken.append(_beside(around) if index < config.num_objects - 1 else around)
+    return places, all_clear
 
 
-def _on_table(rng: np.random.Generator, num: int, config: WorldConfig) -> StateArray:
-    """(num, 3) centres of the world's object, resting on the table."""
-    return sample_on_table(rng, num, config.workspace, 2 * config.rest_height_m)
+def _beside(around: Boxes) -> Boxes:
+    """Boxes of objects, and room for a finger beside them."""
+    return Boxes(around.lower - _BESIDE_OBJECT_M + scene.GAP_M, around.upper + _BESIDE_OBJECT_M - scene.GAP_M)
+
+
+def _on_table(rng: np.random.Generator, num: int, config: WorldConfig, shape: ObjectConfig | None = None) -> StateArray:
+    """(num, 3) centres of an object, by default of the world's first one, resting on the table."""
+    return sample_on_table(rng, num, config.workspace, (shape or config.shape).extent_m[2])
 
 
 def _beside_wall(rng: np.random.Generator, side: StateArray, config: WorldConfig) -> StateArray:
@@ -177,24 +193,76 @@ def _outside_boxes(rng: np.random.Generator, place: StateArray, config: WorldCon
 def sample_goals(
     kind: GoalKind, rng: np.random.Generator, num: int, config: WorldConfig, success_distance_m: float
 ) -> StateArray:
-    """(num, 3) goals, metres.
+    """(num, 3 K) goals, metres.
 
     ``table``: on it. ``air``: out of reach of an object that rests on the table. ``volume``: anywhere in the workspace
     (p = 1 in the paper's words). ``mixed``: as most of the paper's downstream tasks, anywhere in the volume with
     probability 0.7, else on the table. None is where the object would be inside a fixture.
+
+    Of several objects, one has such a goal, and the others have goals on the table. They ``are_apart``.
     """
+    if config.num_objects == 1:
+        return _goals_of(config.shape, kind, rng, num, config, success_distance_m)
 
     def draw(num: int) -> StateArray:
-        table = _on_table(rng, num, config)
+        raised, goal = rng.integers(config.num_objects, size=num), np.empty((num, config.num_objects, 3))
+        for index, body in enumerate(config.bodies):
+            of_kind, lying = (_goals_of(body, each, rng, num, config, success_distance_m) for each in (kind, TABLE))
+            goal[:, index] = np.where((raised == index)[:, None], of_kind, lying)
+        return goal.reshape(num, -1)
+
+    return _drawn_apart(draw, num, config)
+
+
+def _goals_of(
+    shape: ObjectConfig,
+    kind: GoalKind,
+    rng: np.random.Generator,
+    num: int,
+    config: WorldConfig,
+    success_distance_m: float,
+) -> StateArray:
+    """(num, 3) goals for one object."""
+    rest_m = shape.extent_m[2] / 2
+
+    def draw(num: int) -> StateArray:
+        table = _on_table(rng, num, config, shape)
         if kind == "table":
             return table
-        lowest = config.rest_height_m + (success_distance_m if kind == "air" else 0.0)
-        volume = sample_in_volume(rng, num, config.workspace, 2 * config.rest_height_m, lowest_m=lowest)
+        lowest = rest_m + (success_distance_m if kind == "air" else 0.0)
+        volume = sample_in_volume(rng, num, config.workspace, 2 * rest_m, lowest_m=lowest)
         if kind != "mixed":
             return volume
         return np.where(rng.random((num, 1)) < MIXED_AIR_SHARE, volume, table)
 
-    return _clear_of_fixtures(draw, num, config, np.zeros(3))
+    return _clear_of_fixtures(draw, num, config, np.zeros(3), shape)
+
+
+def _drawn_apart(draw: Callable[[int], StateArray], num: int, config: WorldConfig) -> StateArray:
+    """(num, 3 K) goals, each drawn again until its objects ``are_apart``."""
+    goal, near = np.empty((0, 0)), np.ones(num, dtype=bool)
+    for _ in range(_MAX_DRAWS):
+        drawn = draw(int(near.sum()))
+        goal = drawn if not goal.size else goal
+        goal[near] = drawn
+        near = ~are_apart(goal, config)
+        if not near.any():
+            return goal
+    raise ConfigError("world.objects: no room in the workspace for goals of all: make world.workspace larger")
+
+
+def are_apart(goal: StateArray, config: WorldConfig) -> BoolArray:
+    """(N,) whether objects at their places of (N, 3 K) are apart: cubes of 5 cm by 7 cm."""
+    place, least = each_object(goal), least_distances(config)
+    one, other = np.triu_indices(config.num_objects, 1)
+    apart: BoolArray = (np.linalg.norm(place[:, one] - place[:, other], axis=2) >= least[one, other]).all(axis=1)
+    return apart
+
+
+def least_distances(config: WorldConfig) -> StateArray:
+    """(K, K) least distance of two objects that lie side by side, however they are turned, metres."""
+    radius: StateArray = np.array([np.hypot(*body.extent_m[:2]) / 2 for body in config.bodies])
+    return np.add.outer(radius, radius)
 
 
 def sample_in_volume(
@@ -209,11 +277,11 @@ def sample_in_volume(
 def draw_goals(
     kind: GoalKind, rng: np.random.Generator, config: WorldConfig, success_distance_m: float, places: Places
 ) -> StateArray:
-    """(N, 3) goals for N worlds whose things are at ``places``, metres; none is inside an obstacle's place.
+    """(N, 3 K) goals for N worlds whose things are at ``places``, metres; none is inside an obstacle's place.
 
     With a wall, they are on the table in the area on the other side of it than the object. With a box, in its middle,
     as high as an object on the table: one within 5 cm has its underside below the rim; one on the bottom is 5 mm too
-    high. Else ``sample_goals`` draws them.
+    high. ``one``: a mixed goal for one object, and the others are to stay. Else ``sample_goals`` draws them.
 
     Raises:
         TandemError: goals off the table in a world with a fixture, or no room for any.
@@ -227,6 +295,8 @@ def draw_goals(
         if config.fixture == "box":
             in_box: StateArray = places.box + np.array([0.0, 0.0, config.rest_height_m])
             return in_box
+        if kind == "one":
+            return _one_moved(rng, config, success_distance_m, places.object)
         return sample_goals(kind, rng, len(places.object), config, success_distance_m)
 
     goal = draw(places)
@@ -243,6 +313,25 @@ def draw_goals(
     )
 
 
+def _one_moved(
+    rng: np.random.Generator, config: WorldConfig, success_distance_m: float, places: StateArray
+) -> StateArray:
+    """(N, 3 K) goals in which one object has a mixed goal clear of the others, which are to stay where they are."""
+    num = len(places)
+    worlds, moved = np.arange(num), rng.integers(config.num_objects, size=num)
+    goal, near, least = places.copy(), np.ones(num, dtype=bool), least_distances(config)[moved]
+    place = each_object(goal)  # a view
+    for _ in range(_MAX_DRAWS):
+        for index, body in enumerate(config.bodies):
+            here = near & (moved == index)
+            place[here, index] = _goals_of(body, "mixed", rng, int(here.sum()), config, success_distance_m)
+        beside = np.linalg.norm(place - place[worlds, moved][:, None], axis=2) < least
+        near = beside.sum(axis=1) > 1  # it is beside itself
+        if not near.any():
+            return goal
+    raise ConfigError("world.objects: no room for a goal beside the others: make world.workspace larger")
+
+
 def check_goals(kind: GoalKind, config: WorldConfig) -> None:
     """Refuse goals that a world cannot have.
 
@@ -251,6 +340,8 @@ def check_goals(kind: GoalKind, config: WorldConfig) -> None:
     """
     if kind not in GOAL_KINDS:
         raise TandemError(f"goals = {kind!r}; choose one of {', '.join(GOAL_KINDS)}")
+    if kind == "one" and config.num_objects == 1:
+        raise TandemError("goals = 'one' are for worlds of several objects; choose mixed")
     if config.fixture != "none" and kind != "table":
         where = {"wall": "behind it", "box": "in it"}[config.fixture]
         raise TandemError(f"goals = {kind!r} with a {config.fixture}: its goals lie {where}; choose table")
@@ -269,27 +360,39 @@ def gripper_boxes(model: mujoco.MjModel, data: mujoco.MjData) -> Boxes:
 
 
 def inside_obstacles(position: StateArray, obstacles: StateArray, config: WorldConfig) -> BoolArray:
-    """(N,) whether an object at (N, 3) would be inside one of the obstacles at (N, K, 3), metres."""
+    """(N,) whether an object at its place of (N, 3 K) would be inside one of the obstacles at (N, M, 3), metres."""
     half = np.array([each.extent_m for each in config.obstacles]).reshape(-1, 3) / 2
-    return _overlap(_around(position, config.shape), Boxes(obstacles - half, obstacles + half))
+    others = Boxes(obstacles - half, obstacles + half)
+    return _some_object(position, config, lambda around: _overlap(around, others))
 
 
 def inside_fixtures(position: StateArray, config: WorldConfig) -> BoolArray:
-    """(N,) whether an object at (N, 3) would be more than a millimetre inside a fixture or the wall, metres.
+    """(N,) whether an object at its place of (N, 3 K) would be more than a millimetre inside a fixture or the wall.
 
     A box, which is elsewhere in every game, is none of them.
     """
-    around = _around(position, config.shape)
-    return _overlap(Boxes(around.lower + _TOUCHES_M, around.upper - _TOUCHES_M), _around_fixtures(config))
+    fixtures = _around_fixtures(config)
+    return _some_object(
+        position,
+        config,
+        lambda around: _overlap(Boxes(around.lower + _TOUCHES_M, around.upper - _TOUCHES_M), fixtures),
+    )
+
+
+def _some_object(position: StateArray, config: WorldConfig, test: Callable[[Boxes], BoolArray]) -> BoolArray:
+    """(N,) whether the boxes around one of the objects at (N, 3 K) pass a test."""
+    place = each_object(position)
+    tested = [test(_around(place[:, index], body)) for index, body in enumerate(config.bodies)]
+    return tested[0] if len(tested) == 1 else np.any(tested, axis=0)
 
 
 def _clear_of_fixtures(
-    draw: Callable[[int], StateArray], num: int, config: WorldConfig, gap_m: StateArray
+    draw: Callable[[int], StateArray], num: int, config: WorldConfig, gap_m: StateArray, shape: ObjectConfig
 ) -> StateArray:
-    """(num, 3) object centres, each drawn again until the object is that far from all described fixtures."""
+    """(num, 3) centres of an object, each drawn again until it is that far from all described fixtures."""
     position, fixtures = draw(num), _boxes_of(config.fixtures)
     for _ in range(_MAX_DRAWS):
-        around = _around(position, config.shape)
+        around = _around(position, shape)
         inside = _overlap(Boxes(around.lower - gap_m, around.upper + gap_m), fixtures)
         if not inside.any():
             return position

@@ -15,7 +15,7 @@ import numpy as np
 
 from service.base.errors import ConfigError
 from service.config import WorldConfig
-from service.envs.objects import GRIPPER_BIT, OBJECT_BIT, STIFF, TABLE_BIT, add_things, parts_of
+from service.envs.objects import GRIPPER_BIT, OBJECT_BIT, STIFF, TABLE_BIT, add_things, object_names, parts_of
 from service.envs.observations import ACTION
 from service.envs.robot import add_robot, described
 from service.envs.state_layout import OBSTACLE_PREFIX, StateLayout
@@ -104,25 +104,25 @@ def build_layout(config: WorldConfig, *, blocked_fraction: float = 0.0) -> State
     robot = described(config)
     num_joints, num_fingers = len(robot.joints), len(robot.fingers)
     drawn = config.randomisation
-    obstacles = [f"{OBSTACLE_PREFIX}{number + 1}" for number in range(len(config.obstacles))]
+    things = object_names(config) + [f"{OBSTACLE_PREFIX}{number + 1}" for number in range(len(config.obstacles))]
     return StateLayout(
         positions={
             "joints": num_joints,
             "fingers": num_fingers,
-            **{part: size for name in ("object", *obstacles) for part, size in ((name, 3), (f"{name}_quaternion", 4))},
+            **{part: size for name in things for part, size in ((name, 3), (f"{name}_quaternion", 4))},
         },
         velocities={
             "joint_velocities": num_joints,
             "finger_velocities": num_fingers,
-            **{f"{name}_{part}": 3 for name in ("object", *obstacles) for part in ("velocity", "spin")},
+            **{f"{name}_{part}": 3 for name in things for part in ("velocity", "spin")},
         },
-        measured={"contacts": 2, "commands": ACTION.size * config.num_kept_commands},
+        measured={"contacts": 2 * config.num_objects, "commands": ACTION.size * config.num_kept_commands},
         kept={
             "box_place": 3 if config.fixture == "box" else 0,  # the middle of its bottom
             "gripper_blocked": int(blocked_fraction > 0.0),
             "model": int(bool(drawn.model_ranges)),  # its index in the bank
             "delay": int(drawn.delay_steps is not None),
-            "object_offset": 3 if drawn.object_offset_m is not None else 0,
+            "object_offset": 3 * config.num_objects if drawn.object_offset_m is not None else 0,
             "object_noise": 2 if drawn.object_noise_m is not None else 0,  # its std and key
         },
     )

@@ -11,7 +11,7 @@ Sizes = Mapping[str, int]
 OBSTACLE_PREFIX = "obstacle_"
 """Begins the names of the obstacles' positions; ``obstacle_1`` is the first one described."""
 _COLUMNS_EACH = 7
-"""Columns of an obstacle: position and quaternion."""
+"""Columns of an object or obstacle: position and quaternion."""
 
 
 def columns(sizes: Sizes) -> dict[str, slice]:
@@ -56,13 +56,18 @@ class StateLayout:
         return self._columns[name]
 
 
+def pose_columns(layout: StateLayout, first: str, num: int) -> slice:
+    """Columns of a state that hold poses of ``num`` things, of which the first has that name."""
+    start = layout[first].start if num else 0
+    return slice(start, start + _COLUMNS_EACH * num)
+
+
 def obstacle_columns(layout: StateLayout, num: int) -> slice:
     """Columns of a state that hold poses of ``num`` obstacles."""
-    first = layout[f"{OBSTACLE_PREFIX}1"].start if num else 0
-    return slice(first, first + _COLUMNS_EACH * num)
+    return pose_columns(layout, f"{OBSTACLE_PREFIX}1", num)
 
 
-def obstacle_places(states: StateArray, columns: slice) -> StateArray:
-    """(N, K, 3) centres of the obstacles of (N, S) states, metres; a view."""
+def places_at(states: StateArray, columns: slice) -> StateArray:
+    """(N, K, 3) centres of the things whose poses (N, S) states have in these columns, metres; a view."""
     num = (columns.stop - columns.start) // _COLUMNS_EACH
     return states[:, columns].reshape(len(states), num, _COLUMNS_EACH)[:, :, :3]

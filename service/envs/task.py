@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from service.base.types import Array, BoolArray, FloatArray, StateArray
 from service.base.user_code import CodeError
+from service.envs.observations import each_object
 
 if TYPE_CHECKING:
     from service.config import WorldConfig
@@ -108,12 +109,12 @@ class Task:
     description: str = ""
     """A few words on what it asks for."""
     goals: GoalKind | Callable[[View, np.random.Generator], Any] = "mixed"
-    """Where random goals are: ``table``, ``air``, ``volume`` or ``mixed``; or a function of the view at the start and
-    of random numbers to (N, K, 3), metres."""
+    """Where random goals are: ``table``, ``air``, ``volume``, ``mixed``, of several objects ``one``; or a function of
+    the view at the start and of random numbers to (N, K, 3), metres."""
     world: Mapping[str, Any] = field(default_factory=dict)
     """Settings of a world that are replaced."""
     success: Function | None = None
-    """(N,) bool; None: the object is within 5 cm of its goal. What counts is the last step of an episode."""
+    """(N,) bool; None: each object is within 5 cm of its goal. What counts is the last step of an episode."""
     reward: Function | None = None
     """(N,) float that is paid in each step; None: 1 where ``success`` is true, else 0."""
     remember: Function | None = None
@@ -198,7 +199,8 @@ class _NotGiven:
 
 
 def view_of_places(achieved: Array, desired: Array) -> View:
-    """A view of (N, 3) places of the object and (N, 3) goals, which knows nothing else."""
+    """A view of (N, 3 K) places of the objects and (N, 3 K) goals, which knows nothing else."""
     names = ("velocity", "gripper", "fingers", "contacts", "elapsed", "memory")
     velocity, gripper, fingers, contacts, *others = (cast("Any", _NotGiven(name)) for name in names)
-    return View(Bodies(achieved[:, None], velocity), gripper, fingers, contacts, desired[:, None], *others)
+    place, goal = each_object(achieved), each_object(desired)
+    return View(Bodies(place, velocity), gripper, fingers, contacts, goal, *others)

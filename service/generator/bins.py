@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 
 from service.base.types import Array, BoolArray, IntArray, StateArray
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
+from service.envs.observations import distances, each_object
 from service.envs.state_layout import StateLayout, obstacle_columns
 
 AIR_ABOVE_REST_M = 0.05
@@ -33,9 +36,36 @@ def height_bins(positions: StateArray, rest_height_m: float) -> IntArray:
 
 
 def distance_bins(goals: StateArray, start_positions: StateArray) -> IntArray:
-    """(M,) bin between ``DISTANCE_EDGES_M`` of the way from (M, 3) starts to (M, 3) goals, metres."""
-    distance: StateArray = np.linalg.norm(goals - start_positions, axis=-1)
+    """(M,) bin between ``DISTANCE_EDGES_M`` of the longest way from (M, 3 K) starts to (M, 3 K) goals, metres."""
+    distance: StateArray = distances(goals, start_positions).max(axis=1)
     return np.digitize(distance, DISTANCE_EDGES_M).astype(np.int64)
+
+
+def highest(places: StateArray, world: WorldConfig) -> StateArray:
+    """(M, 3) place of the object that is highest above where it rests, of (M, 3 K), as high as the first would be."""
+    place = each_object(places)
+    raised = place[:, :, 2] - np.subtract(world.rest_heights_m, world.rest_height_m)
+    rows, first = np.arange(len(place)), raised.argmax(axis=1)
+    return np.column_stack([place[rows, first, :2], raised[rows, first]])
+
+
+ONE_MOVED, SEVERAL_MOVED, STACKED = range(3)
+"""Arrangements: one object is elsewhere than at the start, several are, or one rests on another."""
+NUM_ARRANGEMENTS = 3
+_STACKED_WITHIN_M = 0.01, 0.025
+"""Up and sideways, of the place where the middle of one is exactly above the other's."""
+
+
+def arrangements(goals: StateArray, starts: StateArray, world: WorldConfig, success_distance_m: float) -> IntArray:
+    """(M,) arrangement of each of (M, 3 K) goals, beside (M, 3 K) places at the start."""
+    several = (distances(goals, starts) > success_distance_m).sum(axis=1) > 1
+    found: IntArray = np.where(several, SEVERAL_MOVED, ONE_MOVED)
+    place, heights = each_object(goals), np.array(world.rest_heights_m)
+    up_m, sideways_m = _STACKED_WITHIN_M
+    for upper, lower in permutations(range(world.num_objects), 2):
+        way = place[:, upper] - place[:, lower] - [0.0, 0.0, heights[upper] + heights[lower]]
+        found[(np.abs(way[:, 2]) <= up_m) & (np.linalg.norm(way[:, :2], axis=1) <= sideways_m)] = STACKED
+    return found
 
 
 CELL_SIZE_M = 0.05
@@ -43,7 +73,7 @@ CELL_SIZE_M = 0.05
 
 
 class GoalCells:
-    """Cells that cover the workspace."""
+    """Cells that cover the workspace, as many for each object."""
 
     def __init__(self, world: WorldConfig, cell_size_m: float) -> None:
         self.bounds_m = world.workspace.lower_m, world.workspace.upper_m
@@ -55,24 +85,35 @@ class GoalCells:
         counted = np.ceil((self.bounds_m[1] - self._lower) / cell_size_m - 1e-9).astype(int)
         self.shape = (int(counted[0]), int(counted[1]), int(counted[2]))
         """Number of cells in x, y and z."""
+        self.num_objects = world.num_objects
+        """K."""
+        self.num_arrangements = NUM_ARRANGEMENTS if self.num_objects > 1 else 0
+        """Of several objects."""
 
     def __len__(self) -> int:
-        """Number of cells."""
-        return int(np.prod(self.shape))
+        """Number of cells, those of the first object first."""
+        return self.num_objects * int(np.prod(self.shape))
 
-    def index(self, goals: StateArray) -> IntArray:
-        """(M,) flat cell of each of (M, 3) goals inside the workspace, metres; upper faces belong to the last cells."""
-        index = np.floor((goals - self._lower) / self.cell_size_m).astype(np.int64)
+    def index(self, places: StateArray) -> IntArray:
+        """(M, K) flat cells of objects at (M, 3 K) inside the workspace; upper faces belong to the last cells."""
+        index = np.floor((each_object(places) - self._lower) / self.cell_size_m).astype(np.int64)
         index = np.clip(index, 0, np.array(self.shape) - 1)
-        return np.ravel_multi_index((index[:, 0], index[:, 1], index[:, 2]), self.shape).astype(np.int64)
+        cell = np.ravel_multi_index((index[..., 0], index[..., 1], index[..., 2]), self.shape).astype(np.int64)
+        return cell + np.arange(self.num_objects) * int(np.prod(self.shape))
 
-    def count(self, goals: StateArray) -> IntArray:
-        """(cells,) how many of (M, 3) goals lie in each cell."""
-        return np.bincount(self.index(goals), minlength=len(self))
+    def of_moved(self, goals: StateArray, starts: StateArray) -> IntArray:
+        """(M,) flat cell of each goal of (M, 3 K): where the object lies that goes furthest from (M, 3 K) starts."""
+        furthest = distances(goals, starts).argmax(axis=1)
+        of_it: IntArray = self.index(goals)[np.arange(len(goals)), furthest]
+        return of_it
+
+    def count(self, index: IntArray) -> IntArray:
+        """(cells,) how often each cell is in an array."""
+        return np.bincount(index.ravel(), minlength=len(self))
 
     def centers(self) -> Array:
-        """(cells, 3) middle of each cell, metres."""
-        index = np.stack(np.unravel_index(np.arange(len(self)), self.shape), axis=-1)
+        """(cells of one object, 3) middle of each cell, metres."""
+        index = np.stack(np.unravel_index(np.arange(int(np.prod(self.shape))), self.shape), axis=-1)
         centers: Array = self._lower + (index + 0.5) * self.cell_size_m
         return centers
 
@@ -80,8 +121,9 @@ class GoalCells:
 class TaskBins:
     """Bins of tasks, a task being a goal and a start, by what makes them hard for Bob.
 
-    They are the goal's height, its distance from the object's start, and the gripper: it is free, it holds the object
-    already, or, where a run blocks some grippers, it is blocked.
+    They are the goal's height, its distance from the object's start, and the gripper: it is free, it holds an object
+    already, or, where a run blocks some grippers, it is blocked. Of several objects the highest and the furthest count,
+    and the arrangement.
 
     Args:
         config: the run.
@@ -89,8 +131,7 @@ class TaskBins:
     """
 
     def __init__(self, config: SelfPlayConfig, layout: StateLayout) -> None:
-        self.rest_height_m = config.world.rest_height_m
-        """Height of the centre of an object that lies on the table."""
+        self.world, self._success_distance_m = config.world, config.game.success_distance_m
         self.some_blocked = config.game.blocked_gripper_fraction > 0.0
         self.obstacles = obstacle_columns(layout, len(config.world.obstacles))
         """Columns of a state that hold poses of obstacles."""
@@ -99,17 +140,27 @@ class TaskBins:
 
     def __len__(self) -> int:
         """Number of bins."""
-        return NUM_TASK_BINS * (2 + self.some_blocked)
+        return NUM_TASK_BINS * (2 + self.some_blocked) * (NUM_ARRANGEMENTS if self.world.num_objects > 1 else 1)
 
     def index(self, goals: StateArray, start_positions: StateArray, start_states: StateArray) -> IntArray:
-        """(M,) bin of each task: (M, 3) goal, (M, 3) position of the object and (M, S) state at the start."""
-        bins = height_bins(goals, self.rest_height_m) * NUM_DISTANCE_BINS + distance_bins(goals, start_positions)
+        """(M,) bin of each task: (M, 3 K) goal, (M, 3 K) positions of the objects and (M, S) state at the start."""
+        heights = height_bins(highest(goals, self.world), self.world.rest_height_m)
+        bins = heights * NUM_DISTANCE_BINS + distance_bins(goals, start_positions)
         kind: IntArray = self.held(start_states) + 2 * self.blocked(start_states).astype(np.int64)
+        if self.world.num_objects > 1:
+            kind = kind * NUM_ARRANGEMENTS + self.arrangements(goals, start_positions)
         return bins + kind * NUM_TASK_BINS
 
+    def arrangements(self, goals: StateArray, starts: StateArray) -> IntArray:
+        """(M,) arrangement of each of (M, 3 K) goals, beside (M, 3 K) places at the start."""
+        return arrangements(goals, starts, self.world, self._success_distance_m)
+
     def held(self, states: StateArray) -> BoolArray:
-        """(M,) whether in (M, S) states a free gripper holds the object: both fingers touched it."""
-        held: BoolArray = (states[:, self._contacts] > 0.0).all(axis=1) & ~self.blocked(states)
+        """(M,) whether in (M, S) states a free gripper holds an object: both fingers touched it."""
+        both: BoolArray = np.all(
+            (states[:, self._contacts] > 0.0).reshape(len(states), self.world.num_objects, 2), axis=2
+        )
+        held: BoolArray = both.any(axis=1) & ~self.blocked(states)
         return held
 
     def blocked(self, states: StateArray) -> BoolArray:

@@ -59,6 +59,11 @@ class SuccessCounts:
         vars(self).update({name: np.array(state[name]) for name in vars(self)})
 
 
+def _novelty(proposals: StateArray) -> StateArray:
+    novelty: StateArray = 1.0 / np.sqrt(1.0 + proposals)
+    return novelty
+
+
 class DifficultyGrid:
     """Bob's success over goal cells that cover the workspace.
 
@@ -73,13 +78,17 @@ class DifficultyGrid:
         """(cells,) either player ever brought an object there in a game."""
         self.proposals = np.zeros(len(cells))
         """(cells,) decayed number of valid proposals, see ``PROPOSAL_DECAY``."""
+        self.arranged = np.zeros(cells.num_arrangements)
+        """(arrangements,) the same, where there are several objects."""
 
     @property
     def num_cells_seen(self) -> int:
         """Cells in which a valid goal was ever proposed."""
         return int(np.count_nonzero(self.seen))
 
-    def record(self, proposed: IntArray, reached: IntArray, tries: IntArray, successes: IntArray) -> int:
+    def record(
+        self, proposed: IntArray, reached: IntArray, tries: IntArray, successes: IntArray, arranged: IntArray
+    ) -> int:
         """Add what an iteration brought, and age the proposals by it.
 
         Args:
@@ -87,6 +96,7 @@ class DifficultyGrid:
             reached: (cells,) steps after which an object was there.
             tries: (cells,) of the present Bob.
             successes: (cells,) of these tries.
+            arranged: (arrangements,) valid proposals; none of one object.
 
         Returns:
             The number of cells in which a valid goal was proposed for the first time.
@@ -95,19 +105,23 @@ class DifficultyGrid:
         self.seen |= proposed > 0
         self.reached |= reached > 0
         self.proposals = PROPOSAL_DECAY * self.proposals + proposed
+        self.arranged = PROPOSAL_DECAY * self.arranged + arranged
         self.counts.record(tries, successes)
         return self.num_cells_seen - before
 
     def novelty(self) -> StateArray:
         """(cells,) how rare proposals are: ``1 / sqrt(1 + n)`` of their decayed count (as in Bellemare et al. 2016)."""
-        novelty: StateArray = 1.0 / np.sqrt(1.0 + self.proposals)
-        return novelty
+        return _novelty(self.proposals)
+
+    def novelty_of_arrangements(self) -> StateArray:
+        """(arrangements,) the same of arrangements; none of one object."""
+        return _novelty(self.arranged)
 
     def near_reached(self) -> BoolArray:
         """(cells,) whether a cell was reached, or shares a face with one that was."""
-        reached = self.reached.reshape(self.cells.shape)
+        reached = self.reached.reshape(self.cells.num_objects, *self.cells.shape)
         near = reached.copy()
-        for axis in range(reached.ndim):
+        for axis in range(1, reached.ndim):
             # Views in which this axis comes first: a change of ``towards`` is one of ``near``.
             towards, beside = np.moveaxis(near, axis, 0), np.moveaxis(reached, axis, 0)
             towards[1:] |= beside[:-1]
@@ -126,10 +140,12 @@ class DifficultyGrid:
     def state(self) -> Arrays:
         """All counts, copied."""
         own = {"seen": self.seen.copy(), "proposals": self.proposals.copy(), "reached": self.reached.copy()}
+        own |= {"arranged": self.arranged.copy()} if self.arranged.size else {}
         return own | join_parts({"cells": self.counts.state()})
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Take over what ``state`` gave."""
         self.seen, self.proposals = np.array(state["seen"]), np.array(state["proposals"])
         self.reached = np.array(state["reached"])
+        self.arranged = np.array(state.get("arranged", self.arranged))
         self.counts.load_state(split_parts(state)["cells"])

@@ -69,8 +69,9 @@ class TaskGenerator:
         self.tasks = TaskBins(config, layout)
         self.grid = DifficultyGrid(self.cells)
         """Bob's success over goal cells."""
-        columns = {"start_state": layout.size, "start_position": 3}
-        self.buffer = Ring(config.generator.replay_buffer_size, **columns, goal=3)
+        num = 3 * config.world.num_objects
+        columns = {"start_state": layout.size, "start_position": num}
+        self.buffer = Ring(config.generator.replay_buffer_size, **columns, goal=num)
         """Earlier valid goals and the states they came from, drawn by learnability (Rutherford et al. 2024)."""
         self.starts = Ring(NUM_STARTS, **columns)
         """States right after a reset."""
@@ -102,6 +103,7 @@ class TaskGenerator:
             held_starts=self.held_starts.rows(),
             learnability=self.difficulty.learnability(),
             novelty=self.grid.novelty() * (1.0 - coverage),
+            novelty_of_arrangements=self.grid.novelty_of_arrangements() * (1.0 - coverage),
             success_rate=np.array(self.grid.mean_success_rate()),
             coverage=np.array(coverage),
             near_reached=self.grid.near_reached(),
@@ -118,7 +120,9 @@ class TaskGenerator:
         """
         self.starts.add(**summary.starts)
         self.held_starts.add(**summary.held_starts)
-        num_new_cells = self.grid.record(summary.proposed, summary.reached, summary.tries, summary.successes)
+        num_new_cells = self.grid.record(
+            summary.proposed, summary.reached, summary.tries, summary.successes, summary.arranged
+        )
         self.difficulty.record(summary.task_tries, summary.task_successes)
         self.buffer.add(**summary.goals)
         self._stop.record(num_new_cells, int(summary.task_tries.sum()), int(summary.task_successes.sum()))

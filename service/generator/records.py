@@ -13,7 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.base.types import Array, BoolArray, IntArray, Metrics, StateArray
-from service.generator.bins import HEIGHT_NAMES, GoalCells, TaskBins, height_bins, in_air
+from service.config import WorldConfig
+from service.envs.observations import distances, each_object
+from service.generator.bins import (
+    HEIGHT_NAMES,
+    NUM_ARRANGEMENTS,
+    GoalCells,
+    TaskBins,
+    height_bins,
+    highest,
+    in_air,
+)
 from service.generator.ring import Rows, join_rows
 from service.generator.validity import Verdict
 
@@ -24,7 +34,7 @@ NUM_HEIGHT_STEPS = 801
 """Up to 0.8 m, the highest workspace there may be."""
 Sums = dict[str, tuple[int, float]]
 """Number of cases and the sum over them, by metric: those of several rounds add up."""
-_COUNTS = ("proposed", "reached", "tries", "successes", "task_tries", "task_successes", "heights")
+_COUNTS = ("proposed", "arranged", "reached", "tries", "successes", "task_tries", "task_successes", "heights")
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +44,11 @@ class GoalRecords:
     start_state: StateArray
     """(N, S) full physics state Bob started from; Alice too, unless ``replayed``."""
     start_position: StateArray
-    """(N, 3) object position there, metres."""
+    """(N, 3 K) positions of the objects there, metres."""
     goal: StateArray
-    """(N, 3) the goal Bob played, metres: Alice's proposal, or a replayed goal where ``replayed``."""
+    """(N, 3 K) the goal Bob played, metres: Alice's proposal, or a replayed goal where ``replayed``."""
     proposal: StateArray
-    """(N, 3) object position at the end of Alice's turn, metres."""
+    """(N, 3 K) positions at the end of Alice's turn, metres; those of its start of what she did not move."""
     verdict: NDArray[np.int8]
     """(N,) ``Verdict`` of Alice's proposal."""
     replayed: BoolArray
@@ -74,41 +84,57 @@ def sampled_goals(records: GoalRecords) -> StateArray:
     """Valid proposals that the current Bob played, at most ``GOALS_PER_ITERATION``.
 
     Returns:
-        (M, 7) start x y z, goal x y z (metres), solved 0/1.
+        (M, 6 K + 1) starts x y z, goals x y z (metres), solved 0/1.
     """
     rows = np.flatnonzero(records.own & ~records.bob_past)[:GOALS_PER_ITERATION]
     solved = records.solved[rows, None].astype(float)
     return np.concatenate([records.start_position[rows], records.goal[rows], solved], axis=1)
 
 
-def alice_sums(records: GoalRecords, rest_height_m: float) -> Sums:
+def of_furthest(goals: Sequence[Sequence[float]]) -> StateArray:
+    """(M, 7) start, goal, solved of ``sampled_goals``: of several objects those of the one that goes furthest.
+
+    Raises:
+        ValueError: rows of other numbers.
+    """
+    rows = np.array(goals, dtype=np.float64).reshape(len(goals), len(goals[0]) if goals else 7)
+    half = rows.shape[1] // 2
+    if rows.shape[1] % 6 != 1:
+        raise ValueError(f"rows of {rows.shape[1]} numbers are no goals")
+    start, goal = each_object(rows[:, :half]), each_object(rows[:, half : 2 * half])
+    furthest = np.arange(len(rows)), np.linalg.norm(goal - start, axis=2).argmax(axis=1)
+    return np.column_stack([start[furthest], goal[furthest], rows[:, -1]])
+
+
+def alice_sums(records: GoalRecords, world: WorldConfig) -> Sums:
     """Metrics of the current Alice's proposals, as sums.
 
     Verdict fractions are over all her proposals; lifted, heights and distance over the valid ones. The distance leaves
-    out worlds whose valid goal was replaced by a replayed one: their records hold the replayed goal's start.
+    out worlds whose valid goal was replaced by a replayed one: their records hold the replayed goal's start. Of several
+    objects the highest and the furthest count.
     """
     verdict = records.verdict[~records.alice_past]
     valid = _valid(records)
-    proposal = records.proposal[valid]
+    proposal = highest(records.proposal[valid], world)
     from_own_start = valid & ~records.replayed
-    distance = np.linalg.norm((records.proposal - records.start_position)[from_own_start], axis=-1)
-    bins = height_bins(proposal, rest_height_m)
+    distance = distances(records.proposal[from_own_start], records.start_position[from_own_start]).max(axis=1)
+    bins = height_bins(proposal, world.rest_height_m)
     cases: dict[str, Array] = {f"alice/{kind.name.lower()}_fraction": verdict == kind for kind in Verdict}
-    cases["alice/lifted_fraction"] = in_air(proposal, rest_height_m)
+    cases["alice/lifted_fraction"] = in_air(proposal, world.rest_height_m)
     cases |= {f"alice/goal_height_{name}_fraction": bins == index for index, name in enumerate(HEIGHT_NAMES)}
     cases["alice/goal_distance_m"] = distance
     cases["alice/goal_height_m"] = proposal[:, 2]
     return sum_up(cases)
 
 
-def bob_sums(records: GoalRecords, rest_height_m: float) -> Sums:
+def bob_sums(records: GoalRecords, world: WorldConfig) -> Sums:
     """Metrics of the current Bob's success by kind of goal, as sums.
 
     No suffix, table and air: the current Alice's valid goals. ``past_alice`` and ``replayed`` stand apart;
     ``from_reset`` is whatever began where a game does, Alice's own goals of a first round among it.
     """
     current = records.current
-    air = in_air(records.goal, rest_height_m)
+    air = in_air(highest(records.goal, world), world.rest_height_m)
     kinds = {
         "": current,
         "_table": current & ~air,
@@ -132,9 +158,9 @@ def means(sums: Sums) -> Metrics:
     return {name: total / num for name, (num, total) in sums.items() if num}
 
 
-def count_heights(records: GoalRecords) -> IntArray:
+def count_heights(records: GoalRecords, world: WorldConfig) -> IntArray:
     """(H,) how many valid proposals of the current Alice there are in each ``HEIGHT_STEP_M`` above the table."""
-    steps = np.floor(records.proposal[_valid(records), 2] / HEIGHT_STEP_M).astype(np.int64)
+    steps = np.floor(highest(records.proposal[_valid(records)], world)[:, 2] / HEIGHT_STEP_M).astype(np.int64)
     return np.bincount(np.clip(steps, 0, NUM_HEIGHT_STEPS - 1), minlength=NUM_HEIGHT_STEPS)
 
 
@@ -152,6 +178,8 @@ class GoalSummary:
 
     proposed: IntArray
     """(cells,) valid proposals, a past Alice's included."""
+    arranged: IntArray
+    """(arrangements,) the same; none of one object."""
     reached: IntArray
     """(cells,) steps after which an object was there, whoever played."""
     tries: IntArray
@@ -173,13 +201,14 @@ class GoalSummary:
     held_starts: Rows
     """The same of later rounds in which the gripper held the object."""
     shown: StateArray
-    """(L, 7) of ``sampled_goals``, for the run directory."""
+    """(L, 6 K + 1) of ``sampled_goals``, for the run directory."""
 
 
 def summarize(
     records: GoalRecords,
     starts: Rows,
     reached: IntArray,
+    proposed_from: StateArray,
     cells: GoalCells,
     tasks: TaskBins,
     *,
@@ -196,6 +225,7 @@ def summarize(
         records: of the round.
         starts: (N,) of the round, where Alice's turns began.
         reached: (cells,) steps of the round after which an object was there.
+        proposed_from: (N, 3 K) places from which Alice's proposals lead.
         cells: of goals.
         tasks: bins of tasks.
         max_goals: of more new goals for the buffer, so many are drawn at random.
@@ -205,22 +235,26 @@ def summarize(
     tried: BoolArray = records.played & ~records.bob_past
     as_proposed: BoolArray = tried & ~(records.replayed & records.from_reset)
     bins = tasks.index(records.goal[tried], records.start_position[tried], records.start_state[tried])
-    sums = alice_sums(records, tasks.rest_height_m) | bob_sums(records, tasks.rest_height_m)
+    sums = alice_sums(records, tasks.world) | bob_sums(records, tasks.world)
     if tasks.some_blocked:
         sums |= _blocked_sums(records, tried, tasks.blocked(records.start_state))
     kept = _some(np.flatnonzero(records.own), max_goals, rng)
     begins: BoolArray = records.round_index == 0
     began = _some(np.flatnonzero(begins), max_starts, rng)
     held = _some(np.flatnonzero(~begins & tasks.held(starts["start_state"])), max_starts, rng)
+    valid: BoolArray = records.verdict == Verdict.VALID
+    proposed = records.proposal[valid], proposed_from[valid]
+    cell = cells.of_moved(records.goal[as_proposed], records.start_position[as_proposed])
     return GoalSummary(
-        proposed=cells.count(records.proposal[records.verdict == Verdict.VALID]),
+        proposed=cells.count(cells.of_moved(*proposed)),
+        arranged=np.bincount(tasks.arrangements(*proposed), minlength=NUM_ARRANGEMENTS)[: cells.num_arrangements],
         reached=reached,
-        tries=cells.count(records.goal[as_proposed]),
-        successes=cells.count(records.goal[as_proposed & records.solved]),
+        tries=cells.count(cell),
+        successes=cells.count(cell[records.solved[as_proposed]]),
         task_tries=np.bincount(bins, minlength=len(tasks)),
         task_successes=np.bincount(bins[records.solved[tried]], minlength=len(tasks)),
         metrics=sums,
-        heights=count_heights(records),
+        heights=count_heights(records, tasks.world),
         goals={name: getattr(records, name)[kept] for name in ("start_state", "start_position", "goal")},
         starts={name: rows[began] for name, rows in starts.items()},
         held_starts={name: rows[held] for name, rows in starts.items()},

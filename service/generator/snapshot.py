@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from service.base.tensors import join_parts, split_parts
 from service.base.types import Array, Arrays, BoolArray, IntArray, StateArray
+from service.config import WorldConfig
 from service.config.self_play import GOAL_SOURCES, SelfPlayConfig
-from service.envs.sampling import GoalKind, inside_obstacles, sample_goals
-from service.envs.state_layout import obstacle_places
-from service.generator.bins import GoalCells, TaskBins, in_air
+from service.envs.observations import distances, each_object
+from service.envs.sampling import GoalKind, are_apart, inside_obstacles, sample_goals
+from service.envs.state_layout import places_at
+from service.generator.bins import AIR_ABOVE_REST_M, GoalCells, TaskBins, highest, in_air
 from service.generator.opponents import RoundPlan
 from service.generator.ring import Rows, join_rows
 from service.generator.sources import NUM_DRAWN, CheckedSource
@@ -24,7 +26,7 @@ LEARNABILITY_FLOOR = 0.01
 """Added to p (1 - p), which is at most 1/4, so solved and hopeless tasks stay drawable and measured."""
 MIN_REPLAY_GOALS = 64
 """Goals the buffer must hold before any is replayed: fewer would be played over and over."""
-_ARRAYS = ("learnability", "novelty", "success_rate", "coverage", "near_reached")
+_ARRAYS = ("learnability", "novelty", "novelty_of_arrangements", "success_rate", "coverage", "near_reached")
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,11 +34,11 @@ class GoalChoice:
     """The goals Bob plays in a round of N worlds, and where both he and the object start."""
 
     goal: StateArray
-    """(N, 3) metres; where not ``played`` it is Alice's proposal as it came."""
+    """(N, 3 K) metres; where not ``played`` it is Alice's proposal as it came."""
     start_state: StateArray
     """(N, S) full physics state."""
     start_position: StateArray
-    """(N, 3) object position there, metres."""
+    """(N, 3 K) positions of the objects there, metres."""
     replayed: BoolArray
     """(N,) the goal and its start come from the buffer, not from this round's Alice."""
     from_reset: BoolArray
@@ -44,7 +46,8 @@ class GoalChoice:
     played: BoolArray
     """(N,) there is a goal for Bob to play."""
     novelty: StateArray
-    """(N,) ``GeneratorSnapshot.novelty`` of the cell of Alice's proposal, in [0, 1]; 0 where it is not valid."""
+    """(N,) ``GeneratorSnapshot.novelty`` of the cell of Alice's proposal, or of its arrangement, whichever is more, in
+    [0, 1]; 0 where it is not valid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +89,8 @@ class GeneratorSnapshot:
     """(task bins,) p (1 - p) of tasks."""
     novelty: StateArray
     """(cells,) how rare proposals there are, times the share of cells in which none was ever made."""
+    novelty_of_arrangements: StateArray
+    """(arrangements,) the same of arrangements of several objects; none of one."""
     success_rate: StateArray
     """() mean over all cells, 0 where no goal was ever proposed."""
     coverage: StateArray
@@ -112,9 +117,9 @@ class GeneratorSnapshot:
         Args:
             plan: who plays.
             start_state: (N, S) full physics state of this round's start.
-            start_position: (N, 3) object position there, metres.
+            start_position: (N, 3 K) positions of the objects there, metres.
             round_index: (N,) 0 where it is the start of a game.
-            proposal: (N, 3) object position at the end of Alice's turn, metres.
+            proposal: (N, 3 K) positions at the end of Alice's turn, metres; those of a start of what she did not move.
             verdict: (N,) ``Verdict`` of the proposal.
             rng: source of the choice.
         """
@@ -126,7 +131,7 @@ class GeneratorSnapshot:
         starts = start_state.copy(), start_position.copy()
         from_reset = (round_index == 0) & ~replayed
         novelty = np.zeros(len(proposal))
-        novelty[valid] = self.novelty[self.cells.index(proposal[valid])]
+        novelty[valid] = self._novelty(proposal[valid], start_position[valid])
         choice = GoalChoice(proposal.copy(), *starts, replayed, from_reset, valid | replayed, novelty)
         if tasks is not None and replayed.any():
             tasks.give(choice, np.flatnonzero(replayed), rng)
@@ -135,17 +140,29 @@ class GeneratorSnapshot:
     @property
     def _own_source(self) -> CheckedSource:
         rates = float(self.coverage), float(self.success_rate)
-        return CheckedSource(self.config, *rates, lambda goal: self.near_reached[self.cells.index(goal)])
+        return CheckedSource(self.config, *rates, self._near)
+
+    def _near(self, goal: StateArray) -> BoolArray:
+        """(M,) whether all objects of (M, 3 K) goals lie in cells that are ``near_reached``."""
+        near: BoolArray = np.all(self.near_reached[self.cells.index(goal)], axis=1)
+        return near
+
+    def _novelty(self, proposal: StateArray, start: StateArray) -> StateArray:
+        """(M,) novelty of (M, 3 K) proposals from (M, 3 K) starts."""
+        novelty: StateArray = self.novelty[self.cells.of_moved(proposal, start)]
+        if not self.novelty_of_arrangements.size:
+            return novelty
+        return np.maximum(novelty, self.novelty_of_arrangements[self.tasks.arrangements(proposal, start)])
 
     def state(self) -> Arrays:
         """All arrays by flat names."""
-        arrays: Arrays = {name: getattr(self, name) for name in _ARRAYS}
+        arrays: Arrays = {name: array for name in _ARRAYS if (array := getattr(self, name)).size}  # no empty ones
         return arrays | join_parts({"buffer": self.buffer, "starts": self.starts, "held_starts": self.held_starts})
 
     def with_state(self, state: Mapping[str, Array]) -> GeneratorSnapshot:
         """A snapshot with the arrays that ``state`` gave, and all else from this one."""
         parts = split_parts(state)
-        arrays: dict[str, Any] = {name: state[name] for name in _ARRAYS}
+        arrays: dict[str, Any] = {name: state[name] for name in _ARRAYS if name in state}
         return replace(self, **arrays, buffer=parts["buffer"], starts=parts["starts"], held_starts=parts["held_starts"])
 
     def _choose_replayed(self, valid: BoolArray, bob_past: BoolArray, rng: np.random.Generator) -> BoolArray:
@@ -173,19 +190,24 @@ class GeneratorSnapshot:
                 # Every second start is in the hand: he learns to carry long before he learns to grasp.
                 starts = join_rows([starts, _drawn(self.held_starts, len(start_state), rng)])
             rows = {"goal": goal} | _drawn(starts, len(goal), rng)
+            if self.cells.num_objects > 1:
+                rows["goal"] = _one_stays(rows["goal"], rows["start_position"], self.config.world, rng)
         num = len(rows["goal"])
         if config.replay_from_reset and len(self.starts["start_position"]):
-            rows = join_rows([rows, {"goal": rows["goal"]} | _drawn(self.starts, num, rng)])
+            again = {"goal": rows["goal"]} | _drawn(self.starts, num, rng)
+            if self.cells.num_objects > 1:
+                again["goal"] = _one_stays(again["goal"], again["start_position"], self.config.world, rng)
+            rows = join_rows([rows, again])
         return _Tasks(rows, self._weight(**rows) * self._is_task(**rows), num)
 
     def _new_goals(self, rng: np.random.Generator) -> StateArray:
-        """(M, 3) goals that Alice did not propose, metres."""
+        """(M, 3 K) goals that Alice did not propose, metres."""
         source = self.config.generator.goal_source
         if source not in GOAL_SOURCES:
             return self._own_source.goals(rng)
         kind: GoalKind = "table" if source == "table" else "mixed"
         goal = sample_goals(kind, rng, NUM_DRAWN, self.config.world, self.config.game.success_distance_m)
-        return goal[self.near_reached[self.cells.index(goal)]] if source == "reached" else goal
+        return goal[self._near(goal)] if source == "reached" else goal
 
     def _weight(self, goal: StateArray, start_state: StateArray, start_position: StateArray) -> StateArray:
         """(M,) weights of tasks: what Bob can learn from each, all alike, or what a user's source says."""
@@ -198,12 +220,27 @@ class GeneratorSnapshot:
         return self._own_source.weights(goal, start_position, weight)
 
     def _is_task(self, goal: StateArray, start_state: StateArray, start_position: StateArray) -> BoolArray:
-        """(M,) whether the object has to be moved, and can be: a closed gripper lifts nothing, obstacles take room."""
+        """(M,) whether an object has to be moved, and can be: a closed gripper lifts nothing, and things take room."""
         world = self.config.world
-        far: BoolArray = np.linalg.norm(goal - start_position, axis=1) > self.config.game.success_distance_m
+        far: BoolArray = distances(goal, start_position).max(axis=1) > self.config.game.success_distance_m
         if world.obstacles:
-            far &= ~inside_obstacles(goal, obstacle_places(start_state, self.tasks.obstacles), world)
-        return far & ~(self.tasks.blocked(start_state) & in_air(goal, self.tasks.rest_height_m))
+            far &= ~inside_obstacles(goal, places_at(start_state, self.tasks.obstacles), world)
+        return far & ~(self.tasks.blocked(start_state) & in_air(highest(goal, world), world.rest_height_m))
+
+
+def _one_stays(goal: StateArray, start: StateArray, world: WorldConfig, rng: np.random.Generator) -> StateArray:
+    """(M, 3 K) goals clear of each other: in every second of those given all objects but one stay where they start.
+
+    What the gripper holds does not stay: nothing holds it while another one is moved. Where the others would be in the
+    way, the goal is as given.
+    """
+    num = world.num_objects
+    moved = rng.integers(2 * num, size=len(goal))
+    lifted = each_object(start)[:, :, 2] > np.add(world.rest_heights_m, AIR_ABOVE_REST_M)
+    moved = np.where((moved < num) & lifted.any(axis=1), lifted.argmax(axis=1), moved)
+    stays = (moved[:, None] < num) & (moved[:, None] != np.arange(num))
+    kept = np.where(np.repeat(stays, 3, axis=1), start, goal)
+    return np.where(are_apart(kept, world)[:, None], kept, goal)
 
 
 def _drawn(rows: Rows, num: int, rng: np.random.Generator) -> Rows:

@@ -15,6 +15,7 @@ from service.base.types import Array, BoolArray, StateArray
 from service.base.user_code import CodeError, checked, find_class, naming_errors_of
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
+from service.envs.observations import each_object
 from service.envs.sampling import GoalKind, sample_goals
 from service.generator.validity import in_workspace
 
@@ -33,10 +34,10 @@ class Known:
     success_rate: float
     """Bob's, mean over all cells; 0 where no goal was proposed."""
     near: Callable[[StateArray], BoolArray]
-    """Whether (M, 3) goals are in cells to which an object was brought in a game, or beside one: (M,)."""
+    """Whether (M, 3 K) goals are in cells to which their objects were brought in a game, or beside one: (M,)."""
 
     def random(self, rng: np.random.Generator, num: int = NUM_DRAWN, kind: GoalKind = "mixed") -> StateArray:
-        """(num, 3) goals as those of an evaluation, metres."""
+        """(num, 3 K) goals as those of an evaluation, metres."""
         return sample_goals(kind, rng, num, self.world, self.success_distance_m)
 
 
@@ -69,20 +70,21 @@ class CheckedSource:
             self._source = kind()
 
     def goals(self, rng: np.random.Generator) -> StateArray:
-        """(M, 3) goals in the workspace, metres."""
+        """(M, 3 K) goals in the workspace, metres."""
         with naming_errors_of(self._origin):
             goal = np.asarray(self._source.goals(self._known, rng))
-        goal = checked(f"{self._origin}: {self._name}.goals", goal, (len(np.atleast_1d(goal)), 1, 3))
-        inside = in_workspace(goal[:, 0], self._known.world.workspace)
-        kept: StateArray = goal[inside, 0]
+        shape = len(np.atleast_1d(goal)), self._known.world.num_objects, 3
+        goal = checked(f"{self._origin}: {self._name}.goals", goal, shape)
+        inside = in_workspace(goal, self._known.world.workspace).all(axis=1)
+        kept: StateArray = goal[inside].reshape(-1, shape[1] * 3)
         return kept
 
     def weights(self, goal: StateArray, start: StateArray, learnability: StateArray) -> StateArray:
-        """(M,) weights of tasks with (M, 3) goals and starts."""
+        """(M,) weights of tasks with (M, 3 K) goals and starts."""
         if not len(goal):
             return np.zeros(0)
         with naming_errors_of(self._origin):
-            weight = np.asarray(self._source.weights(self._known, goal[:, None], start[:, None], learnability))
+            weight = np.asarray(self._source.weights(self._known, each_object(goal), each_object(start), learnability))
         where = f"{self._origin}: {self._name}.weights"
         weight = checked(where, weight, learnability.shape)
         if (weight < 0.0).any():

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from service.base.types import BoolArray, StateArray
 from service.config import WorkspaceConfig
+from service.envs.observations import distances, each_object
 
 FALLEN_BELOW_M = -0.02
 """Height of the object's centre under which it has left the table; the table top is at 0."""
@@ -29,25 +30,39 @@ def in_workspace(position: StateArray, workspace: WorkspaceConfig) -> BoolArray:
     return inside
 
 
+def proposed(start_position: StateArray, end_position: StateArray, success_distance_m: float) -> StateArray:
+    """(N, 3 K) goal of each turn: where the objects are. What it did not move, while it moved another, is to stay.
+
+    Args:
+        start_position: (N, 3 K) object centres before, metres.
+        end_position: (N, 3 K) object centres after it, metres.
+        success_distance_m: least move.
+    """
+    moved = distances(end_position, start_position) > success_distance_m
+    kept = ~moved & moved.any(axis=1, keepdims=True)
+    return np.where(np.repeat(kept, 3, axis=1), start_position, end_position)
+
+
 def classify_goal(
     start_position: StateArray, end_position: StateArray, workspace: WorkspaceConfig, success_distance_m: float
 ) -> NDArray[np.int8]:
-    """Verdict on where the object lies at the end of Alice's turn: the first reason that applies.
+    """Verdict on where the objects lie at the end of Alice's turn: the first reason that applies.
 
-    Fallen (under the table top, or not finite), then not moved by MORE than the success distance, then outside the
-    workspace.
+    One has fallen (under the table top, or not finite), then none has moved by MORE than the success distance, then one
+    is outside the workspace.
 
     Args:
-        start_position: (N, 3) object centre before her turn, metres.
-        end_position: (N, 3) object centre after it, metres.
+        start_position: (N, 3 K) object centres before her turn, metres.
+        end_position: (N, 3 K) object centres after it, metres.
         workspace: the box in which goals are valid.
         success_distance_m: Bob's success distance, also the least move.
 
     Returns:
         (N,) of ``Verdict``.
     """
-    fallen = ~np.all(np.isfinite(end_position), axis=-1) | (end_position[:, 2] < FALLEN_BELOW_M)
-    moved = np.linalg.norm(end_position - start_position, axis=-1) > success_distance_m
-    reasons = [fallen, ~moved, ~in_workspace(end_position, workspace)]
+    end = each_object(end_position)
+    fallen = ~np.all(np.isfinite(end_position), axis=-1) | (end[..., 2] < FALLEN_BELOW_M).any(axis=-1)
+    moved = (distances(end_position, start_position) > success_distance_m).any(axis=-1)
+    reasons = [fallen, ~moved, ~in_workspace(end, workspace).all(axis=-1)]
     verdicts = [Verdict.FALLEN, Verdict.NOT_MOVED, Verdict.OUTSIDE]
     return np.select(reasons, verdicts, default=Verdict.VALID).astype(np.int8)

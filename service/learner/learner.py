@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 import torch
@@ -23,7 +24,11 @@ from service.learner.samples import (
     DemonstrationHistory,
     DemonstrationRows,
     Samples,
-    reflect_at_random,
+    Symmetry,
+    exchange,
+    exchange_at_random,
+    reflection,
+    transform_at_random,
 )
 from service.policies import networks
 
@@ -191,14 +196,24 @@ class Learner:
         metrics = ppo.update(self._alice, samples, imitated, how, self._rng, version=self.version)
         return _prefixed("alice", metrics) | counted
 
+    def _exchanges(self) -> list[Symmetry]:
+        """Exchanges of objects that are alike but for their color."""
+        alike = [body.model_dump(exclude={"color"}) for body in self.config.world.bodies]
+        pairs = combinations(range(len(alike)), 2)
+        return [exchange(self._layouts, one, other) for one, other in pairs if alike[one] == alike[other]]
+
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
         config, bob = self.config.learner, self._bob
         samples = ppo.collect([rollout.bob for rollout in rollouts], bob)
         metrics = {"num_bob_samples": float(_num(samples))}
         mirrors, helped = config.bob.mirror == "random", solved_share(rollouts) <= config.bob_help_max_success
         if samples is not None and mirrors and helped:
-            samples = reflect_at_random(samples, self._layouts, bob, self._rng)
-        demonstrations = self._to_clone(DEMONSTRATIONS, [each.demonstrations for each in rollouts])
+            for symmetry in (reflection(self._layouts), *self._exchanges()):
+                samples = transform_at_random(samples, symmetry, bob, self._rng)
+        shown = [each.demonstrations for each in rollouts]
+        for symmetry in self._exchanges() if mirrors else ():
+            shown = [exchange_at_random(each, symmetry, self._rng) for each in shown]
+        demonstrations = self._to_clone(DEMONSTRATIONS, shown)
         metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + mirrors))
         updated = ppo.update(
             bob, samples, demonstrations if helped else None, config.abc, self._rng, version=self.version

@@ -29,15 +29,15 @@ class Step(NamedTuple):
     """A step of N worlds."""
 
     previous: FloatArray
-    """(N, 11) positions one step before ``positions``."""
+    """(N, P) positions one step before ``positions``."""
     positions: FloatArray
-    """(N, 11) that were acted on."""
+    """(N, P) that were acted on."""
     before: FloatArray
-    """(N, 11) one env step before ``following``: those that were acted on, where an action lasts for one."""
+    """(N, P) one env step before ``following``: those that were acted on, where an action lasts for one."""
     following: FloatArray
-    """(N, 11) that the actions led to."""
+    """(N, P) that the actions led to."""
     goal: FloatArray
-    """(N, 3) metres."""
+    """(N, 3 K) metres."""
     reward: FloatArray
     """(N,) of the worlds' task."""
     ended: BoolArray
@@ -65,7 +65,7 @@ class TabletopWorlds(ABC):
         self.env: Any = env
         self._see(env.reset(seed=seed)[0])
         self.previous = self.positions
-        """(N, 11) positions one step ago; at an episode's start those of now."""
+        """(N, P) positions one step ago; at an episode's start those of now."""
 
     @abstractmethod
     def inputs(self) -> FloatArray:
@@ -129,9 +129,9 @@ class TabletopWorlds(ABC):
 
     def _see(self, observation: dict[str, FloatArray]) -> None:
         self.positions: FloatArray = observation["observation"].copy()
-        """(N, 11) now."""
+        """(N, P) now."""
         self.goal: FloatArray = observation["desired_goal"].copy()
-        """(N, 3) metres."""
+        """(N, 3 K) metres."""
 
 
 BatchMaker = Callable[[ReplayBuffer, int, np.random.Generator], "Batch"]

@@ -30,6 +30,8 @@ def take_over(
     Returns:
         What was taken, in words.
     """
+    if (there := _size(before, "object")) != (here := _size(after, "object")):
+        return f"not taken, it was trained with {there // 3} objects, here is {here // 3}"
     own = network.state_dict()
     constants = {name for name, _ in network.named_buffers()}  # of the layout; a learner's state has none
     if missing := sorted((own.keys() ^ given.keys()) - constants):
@@ -71,6 +73,16 @@ def _inputs(
     """Layouts of all inputs that a policy or a value network has: the whole, its positions, and with the way to go."""
     pairs = [(before, after)]
     if "goal" in before.columns and "goal_from_object" not in before.columns:  # Bob's
-        pairs.append((before + GOAL_FROM_OBJECT, after + GOAL_FROM_OBJECT))
+        pairs.append((_with_way(before), _with_way(after)))
         pairs.append((before.without("goal"), after.without("goal")))
     return tuple(pairs)
+
+
+def _size(layout: ObservationLayout, name: str) -> int:
+    columns = layout[name]
+    return int(columns.stop - columns.start)
+
+
+def _with_way(layout: ObservationLayout) -> ObservationLayout:
+    """A layout of Bob's, and the ways to the goals."""
+    return layout + GOAL_FROM_OBJECT.of(_size(layout, "goal") // 3)

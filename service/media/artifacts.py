@@ -68,7 +68,9 @@ def _draw_video(directory: RunDirectory, trained: Trained) -> Path:
 
 
 def paths_of(trained: Trained, num: int, num_steps: int, seed: int) -> tuple[StateArray, str]:
-    """(num, num_steps + 1, 3) metres where random skills or compositions of primitives move the object; what one is.
+    """(num, num_steps + 1, 3) metres where random skills or compositions move the object; what one is called.
+
+    Of K objects K times as many.
 
     Raises:
         TandemError: it has neither.
@@ -77,7 +79,7 @@ def paths_of(trained: Trained, num: int, num_steps: int, seed: int) -> tuple[Sta
         return skill_paths(trained.skills, trained.world, num_skills=num, num_steps=num_steps, seed=seed), "skill"
     return (
         skill_trajectories(trained.primitives, trained.world, num_skills=num, num_steps=num_steps, seed=seed),
-        "composition",
+        "composition" if trained.world.num_objects == 1 else "path",
     )
 
 

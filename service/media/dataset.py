@@ -21,6 +21,7 @@ from service.config import Config
 from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.gym.tabletop import action_space, goal_space
+from service.envs.observations import distances
 from service.media.recording import RecordedEpisodes, RecordedRound
 
 _NAME = re.compile(r"(?![\w-]/[\w-]+$)(?:[\w-]+/)*[\w-]+-v[0-9]+")  # what Minari takes
@@ -37,7 +38,7 @@ class Played:
     actions: FloatArray
     """(T, 4)."""
     goal: StateArray
-    """(3,) metres."""
+    """(3 K,) metres."""
     is_alice: bool = False
 
 
@@ -140,7 +141,7 @@ def _arrays(played: Played, worlds: WorldBatch, success_distance_m: float) -> di
     num_steps, num = len(played.actions), len(played.states)
     worlds.restore(played.states, np.arange(worlds.num_worlds) < num)
     achieved = np.clip(worlds.object_position[:num], -_FURTHEST_M, _FURTHEST_M)
-    success = np.linalg.norm(achieved - played.goal, axis=1) <= success_distance_m
+    success = np.all(distances(achieved, played.goal) <= success_distance_m, axis=1)
     return {
         "observations": {
             "observation": np.clip(worlds.positions()[:num], -_FURTHEST_M, _FURTHEST_M),

@@ -17,6 +17,7 @@ from service.actors.coverage import visited_share
 from service.base.errors import TandemError
 from service.base.types import StateArray
 from service.config import WorkspaceConfig
+from service.generator.records import of_furthest
 from service.media.figures import (
     BLUE,
     FAINT,
@@ -336,9 +337,11 @@ def plot_goals(run_dir: Path, workspace: WorkspaceConfig) -> Path:
 
 
 def _goals(records: Sequence[dict[str, Any]]) -> StateArray:
-    """The records' goals, (number, 7): start xyz, goal xyz, solved; any that is not finite is left out."""
-    rows = [row for record in records for row in record.get("goals") or ()]
-    goals = np.array(rows, dtype=np.float64).reshape(len(rows), 7)
+    """The records' goals, (number, 7): start xyz, goal xyz, solved; any that is not finite is left out.
+
+    Of several objects, those of the one that goes furthest.
+    """
+    goals = of_furthest([row for record in records for row in record.get("goals") or ()])
     return goals[np.isfinite(goals).all(axis=1)]
 
 

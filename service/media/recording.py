@@ -23,9 +23,10 @@ from service.base.types import BoolArray, FloatArray, StateArray
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
+from service.envs.observations import distances
 from service.envs.sampling import GoalKind
 from service.envs.task import Task
-from service.generator.bins import in_air
+from service.generator.bins import highest, in_air
 from service.generator.generator import TaskGenerator
 from service.generator.opponents import Opponents
 from service.generator.records import GoalRecords
@@ -52,7 +53,7 @@ class RecordedRound:
     bob_actions: FloatArray
     """(T2, 4)."""
     goal: StateArray
-    """(3,) metres."""
+    """(3 K,) metres."""
     solved: bool
     verdict: Verdict = Verdict.VALID
 
@@ -64,7 +65,7 @@ class RecordedEpisodes:
     states: StateArray
     """(T + 1, N, S)."""
     goal: StateArray | None
-    """(N, 3) metres; None for skills, which have no goal."""
+    """(N, 3 K) metres; None for skills, which have no goal."""
     reached: BoolArray
     """(T + 1, N) the object is within the success distance."""
     actions: FloatArray | None = None
@@ -106,7 +107,7 @@ def record_rounds(
     played = _play(config, alice, bob, num_worlds=max(_NUM_WORLDS, num_rounds), seed=seed)
     batches = islice(played, _MAX_ROLLOUTS)
     for records, recorded in counted(batches, "playing rounds", _MAX_ROLLOUTS, "batches at most"):
-        rounds += zip(_interest(records, config.world.rest_height_m), recorded, strict=True)
+        rounds += zip(_interest(records, config.world), recorded, strict=True)
         if sum(played for (played, *_), _ in rounds) >= num_rounds:
             break
     rounds.sort(key=lambda pair: pair[0], reverse=True)
@@ -155,7 +156,7 @@ def record_on_goals(
         trained: who acts.
         num_episodes: of random goals.
         seed: of starts and random goals.
-        goals: a kind of random goals, or (N, 3) metres, one for each of N episodes; None: of its usual kind.
+        goals: a kind of random goals, or (N, 3 K) metres, one for each of N episodes; None: of its usual kind.
     """
     points = goals if isinstance(goals, np.ndarray) else None
     return record_episodes(
@@ -250,7 +251,8 @@ def _record(
     ]
 
 
-def _interest(records: GoalRecords, rest_height_m: float) -> Iterator[_Interest]:
+def _interest(records: GoalRecords, world: WorldConfig) -> Iterator[_Interest]:
     """Sort keys of each world's round: Bob played it, its goal is in the air, its distance in metres."""
-    distance_m = np.linalg.norm(records.goal - records.start_position, axis=1)
-    return zip(records.played, in_air(records.goal, rest_height_m), distance_m, strict=True)
+    distance_m = distances(records.goal, records.start_position).max(axis=1)
+    lifted = in_air(highest(records.goal, world), world.rest_height_m)
+    return zip(records.played, lifted, distance_m, strict=True)

@@ -9,13 +9,14 @@ import numpy as np
 import torch
 
 from service.actors.distillation import DistillationWorlds
-from service.actors.evaluation import EVALUATED_GOALS, EVALUATION_SEED, success_metrics
+from service.actors.evaluation import EVALUATION_SEED, evaluated_goals, success_metrics
 from service.base.errors import TandemError
 from service.base.types import Arrays, Metrics, StateArray
 from service.config.distillation import DistillingConfig
 from service.config.world import ObservedConfig
-from service.envs.observations import layouts
+from service.envs.observations import each_object, layouts
 from service.generator.bins import CELL_SIZE_M, GoalCells
+from service.generator.validity import in_workspace
 from service.learner import transfer
 from service.learner.distillation import Distiller
 from service.methods.method import Iteration, Method, State, goal_grid
@@ -94,7 +95,7 @@ class Distillation(Method):
         return success_metrics(
             numpy_bob(self.parameters()),
             self._config,
-            EVALUATED_GOALS,
+            evaluated_goals(self._config.world),
             run.evaluation_episodes,
             seed=EVALUATION_SEED,
             num_threads=run.num_threads,
@@ -138,9 +139,9 @@ class Distillation(Method):
         self._meet_teacher(dict(state["teacher"]), ObservedConfig.model_validate(state["teacher_observed"]))
 
     def _count_goals(self, goal: StateArray, solved: np.ndarray) -> None:
-        inside = (goal >= self._cells.bounds_m[0]).all(axis=1) & (goal <= self._cells.bounds_m[1]).all(axis=1)
-        self._tries += self._cells.count(goal[inside])
-        self._solved += self._cells.count(goal[inside & solved])
+        inside = in_workspace(each_object(goal), self._config.world.workspace).all(axis=1)
+        self._tries += self._cells.count(self._cells.index(goal[inside]))
+        self._solved += self._cells.count(self._cells.index(goal[inside & solved]))
 
     def _meet_teacher(self, parameters: Arrays, observed: ObservedConfig) -> None:
         """Make the worlds in which the teacher is asked.
@@ -165,6 +166,8 @@ class Distillation(Method):
     def _take_over(self, start: Trained) -> None:
         """Begin with the teacher's parameters, as far as they fit."""
         world = self._config.world
+        if (there := start.world.num_objects) != (here := world.num_objects):
+            raise TandemError(f"--from {start.reference}: it was trained with {there} objects, here are {here}")
         if start.world.num_observed_obstacles not in (0, num := len(world.obstacles)):
             raise TandemError(
                 f"--from {start.reference}: it sees {start.world.num_observed_obstacles} obstacles, here are {num}: "

@@ -196,13 +196,18 @@ def goal_grid(
         num_env_steps: their env steps.
     """
     centers = cells.centers().reshape(-1, 3)
+    if cells.num_objects > 1:  # a place is one cell, whichever object's goal is there
+        tries = num_tries.reshape(cells.num_objects, -1)
+        weight = tries + 1e-9
+        success_rate = (success_rate.reshape(tries.shape) * weight).sum(axis=0) / weight.sum(axis=0)
+        num_tries, shown = tries.sum(axis=0), np.unique(shown % len(centers))
     lower, upper = cells.bounds_m
     return GoalGrid(
         iteration=iteration,
         num_env_steps=num_env_steps,
         cell_size_m=cells.cell_size_m,
         shape=cells.shape,
-        num_cells=len(cells),
+        num_cells=len(centers),
         lower_m=lower,
         upper_m=upper,
         cells=tuple(

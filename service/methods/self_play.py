@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from service.actors.evaluation import EVALUATED_GOALS
+from service.actors.evaluation import evaluated_goals
 from service.actors.rollout import Rollout, from_arrays, to_arrays
 from service.base.errors import TandemError
 from service.base.types import Metrics
@@ -142,7 +142,7 @@ class LocalSelfPlay(SelfPlay):
 
     def evaluate(self) -> Metrics:
         """Success of the Bob who played the last round on the run's goals, without noise."""
-        return self._actor.evaluate(self._played, EVALUATED_GOALS)
+        return self._actor.evaluate(self._played, evaluated_goals(self.config.world))
 
     def parameters(self) -> Parameters:
         """The newest Bob, as he is evaluated and published."""

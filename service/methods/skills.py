@@ -117,7 +117,7 @@ class SkillDiscovery(Method):
         lower, upper = self._cells.bounds_m
         inside = ((end >= lower) & (end <= upper)).all(axis=1)
         moved = inside & (distance > self._config.success_distance_m)
-        self._visits += self._cells.count(end[moved])
+        self._visits += self._cells.count(self._cells.index(end[moved]))
         lifted = inside & in_air(end, self._config.world.rest_height_m)
         return {
             "skills/moved_fraction": float(moved.mean()),

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from service.actors.evaluation import DeterministicPolicy, Evaluation
 from service.base.errors import ConfigError, TandemError
-from service.base.types import Metrics
+from service.base.types import FloatArray, Metrics
 from service.base.user_code import recorded
 from service.config.distillation import DistillingConfig
 from service.config.frozen import first_error
@@ -23,7 +23,6 @@ from service.config.self_play import MCPConfig, SelfPlayConfig
 from service.config.task import TaskConfig
 from service.config.world import WorldConfig
 from service.envs.gym.vector import TabletopVectorEnv
-from service.envs.observations import POSITIONS
 from service.envs.tasks import find_task
 from service.learner.off_policy import OffPolicyLoop
 from service.learner.replay import ReplayBuffer
@@ -165,16 +164,27 @@ class Hindsight:
         rows = replay.read(places)
         if self.share:
             other = rng.random(size) < self.share
-            achieved = replay.column("following", replay.draw_later(places, rng))[:, POSITIONS["object"]]
-            rows["goal"][other] = achieved[other]
+            seen = self._worlds.seen
+            goal = replay.column("following", replay.draw_later(places, rng))[:, seen.positions["object"]]
+            if seen.num_objects > 1:
+                goal = _mixed(goal, rows["goal"], rng)
+            rows["goal"][other] = goal[other]
             relabelled = {name: values[other] for name, values in rows.items()}
-            rows["reward"][other, 0] = self._worlds.rewards(relabelled, achieved[other])
+            rows["reward"][other, 0] = self._worlds.rewards(relabelled, goal[other])
         return Batch(
             learner_inputs(rows["previous"], rows["positions"], rows["goal"], self._worlds.seen),
             rows["action"],
             rows["reward"][:, 0],
             learner_inputs(rows["before"], rows["following"], rows["goal"], self._worlds.seen),
         )
+
+
+def _mixed(achieved: FloatArray, asked: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """(B, 3 K) goals of which each object has its place of achieved or of asked ones; one at least is achieved."""
+    size, num_objects = len(achieved), achieved.shape[1] // 3
+    taken = rng.random((size, num_objects)) < 0.5
+    taken[np.arange(size), rng.integers(num_objects, size=size)] = True
+    return np.where(np.repeat(taken, 3, axis=1), achieved, asked)
 
 
 def make_loop(config: TaskConfig, method: TaskMethod, trained: Trained, worlds: TaskWorlds) -> OffPolicyLoop:
@@ -227,6 +237,7 @@ def begin(config: TaskConfig, registry: Path | str, start_from: Trained | None) 
         raise ConfigError("world: a task is learned in the world of its primitives; leave out world")
     how.check(found)
     task = find_task(config.task, config.code)
+    found.playing(task)  # is refused where it has not as many objects
     check_task(task, found.config.world, relabels=how.her_ratio is not None)
     exact = config.model_copy(
         update={

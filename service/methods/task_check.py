@@ -11,7 +11,8 @@ from service.base.types import BoolArray
 from service.base.user_code import CodeError, place_of
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.observations import ACTION
+from service.envs.objects import object_names
+from service.envs.observations import ACTION, each_object
 from service.envs.rules import Rules
 from service.envs.task import Task, View
 
@@ -49,7 +50,7 @@ def check_task(task: Task, world: WorldConfig, *, relabels: bool = False) -> Non
 
         if relabels and task.is_own:  # without the memory
             try:
-                rules.reward(View.of_rows(rules.view(goal).rows(), goal[:, None].astype(np.float32)))
+                rules.reward(View.of_rows(rules.view(goal).rows(), each_object(goal.astype(np.float32))))
             except CodeError as error:
                 raise ConfigError(
                     f"{error}: hindsight asks what would have been paid for other goals. Give a reward that does "
@@ -61,7 +62,8 @@ def check_task(task: Task, world: WorldConfig, *, relabels: bool = False) -> Non
             rules.advance(goal)
             at_random |= solved()
         rules.begin(np.ones(_NUM_WORLDS, dtype=bool))
-        place, way = worlds.layout["object"], goal - start[:, worlds.layout["object"]]
+        place = np.concatenate([np.r_[worlds.layout[name]] for name in object_names(world)])
+        way = goal - start[:, place]
         for step in range(task.episode_steps):  # there in half of the time, then it stays
             moved = start.copy()
             moved[:, place] += way * min(1.0, (step + 1) / max(1, task.episode_steps // 2))

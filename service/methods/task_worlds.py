@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 
 from service.base.types import Array, Arrays, BoolArray, FloatArray
-from service.envs.observations import PAPER, POSITIONS, Layouts
+from service.envs.observations import PAPER, Layouts
 from service.envs.task import num_in_rows
 from service.learner.off_policy import Step, TabletopWorlds
 from service.learner.replay import Columns
@@ -27,8 +27,9 @@ def columns(seen: Layouts, *, view: bool = False) -> dict[str, int]:
     They are positions one env step ago, now, one env step before it ended and when it ended, goal and reward; with
     ``view`` also what the functions of a task saw when it ended.
     """
-    kept = {**dict.fromkeys(_POSITIONS, seen.positions.size), "goal": 3, "reward": 1}
-    return {**kept, "view": num_in_rows(1)} if view else kept
+    num = seen.num_objects
+    kept = {**dict.fromkeys(_POSITIONS, seen.positions.size), "goal": 3 * num, "reward": 1}
+    return {**kept, "view": num_in_rows(num)} if view else kept
 
 
 class TaskWorlds(TabletopWorlds):
@@ -62,11 +63,11 @@ class TaskWorlds(TabletopWorlds):
         return {**columns, "reward": step.reward[:, None], "action": actions}, step.ended
 
     def rewards(self, rows: Columns, goal: FloatArray) -> FloatArray:
-        """(B,) rewards of transitions, (B, size) a column, had their goals (B, 3) been others."""
+        """(B,) rewards of transitions, (B, size) a column, had their goals (B, 3 K) been others."""
         if "view" in rows:
             paid: FloatArray = self.env.unwrapped.rewards_of(rows["view"], goal)
             return paid
-        paid = self.env.compute_reward(rows["following"][:, POSITIONS["object"]], goal, {})
+        paid = self.env.compute_reward(rows["following"][:, self.seen.positions["object"]], goal, {})
         return paid
 
     def state(self) -> tuple[Arrays, Any]:

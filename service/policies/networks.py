@@ -189,7 +189,7 @@ class Primitives(nn.Module):
 class Gate(nn.Module):
     """The primitives' weights (..., K) at (..., O) observations, each in [floor, 1].
 
-    Its network sees, besides the observation, the goal relative to the object.
+    Its network sees, besides the observation, the goals relative to their objects.
     """
 
     weight_floor: Tensor
@@ -197,7 +197,7 @@ class Gate(nn.Module):
     def __init__(self, config: MCPConfig, layouts: Layouts = PAPER) -> None:
         """Build; initial weights scatter around one half."""
         super().__init__()
-        self._goal = layouts.bob["goal"]
+        self._goal, self._object = layouts.bob["goal"], layouts.bob["object"]
         self.input = InputNormalisation(layouts.gate.normalisation)
         self.hidden = hidden_layers(layouts.gate.size, config.gate_hidden_sizes)
         self.output = initialised(nn.Linear(config.gate_hidden_sizes[-1], config.num_primitives), gain=_GATE_GAIN)
@@ -205,7 +205,7 @@ class Gate(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         """Weights; not normalised to sum to one, as in the paper."""
-        goal_from_object = observation[..., self._goal] - observation[..., POSITIONS["object"]]
+        goal_from_object = observation[..., self._goal] - observation[..., self._object]
         features = torch.cat((observation, goal_from_object), dim=-1)
         openness: Tensor = self.output(self.hidden(self.input(features))).sigmoid()
         return self.weight_floor + (1.0 - self.weight_floor) * openness

@@ -19,13 +19,19 @@ MCP_LOG_STD_MIN = -5.0
 
 STEP_SCALE_M = 0.02
 """Scale of movements in a step, as inputs: the hand's full speed is two to three times as much."""
-_MOVED = [*range(*POSITIONS["effector"].indices(POSITIONS.size)), *range(*POSITIONS["object"].indices(POSITIONS.size))]
-NUM_MOTION_INPUTS = POSITIONS.size + len(_MOVED)
-"""Positions 11, movements of end effector 3 and object 3: 17; where more is observed, that comes besides."""
+
+
+def moved_columns(layout: ObservationLayout) -> list[int]:
+    """Columns of positions whose movements are inputs: end effector and objects."""
+    return [column for name in ("effector", "object") for column in range(layout[name].start, layout[name].stop)]
+
+
+NUM_MOTION_INPUTS = POSITIONS.size + len(moved_columns(POSITIONS))
+"""Of one object: positions 11, movements of end effector 3 and object 3; where more is observed, that comes besides."""
 
 
 def motion_inputs(previous: FloatArray, positions: FloatArray, layout: ObservationLayout = POSITIONS) -> FloatArray:
-    """(N, P + 6) inputs, all about 1: metres are too small for a new network.
+    """(N, P + 3 + 3 K) inputs, all about 1: metres are too small for a new network.
 
     Positions at one moment do not say how fast the arm and the object move: the arm lags behind its commands, and what
     was pushed slides on. Two moments do, and a real robot has them; no velocity is measured.
@@ -36,7 +42,8 @@ def motion_inputs(previous: FloatArray, positions: FloatArray, layout: Observati
         layout: of positions.
     """
     seen = (positions - layout.normalisation.offset) / layout.normalisation.scale
-    moved = (positions[:, _MOVED] - previous[:, _MOVED]) / np.float32(STEP_SCALE_M)
+    columns = moved_columns(layout)
+    moved = (positions[:, columns] - previous[:, columns]) / np.float32(STEP_SCALE_M)
     inputs: FloatArray = np.concatenate((seen, moved), axis=1)
     return np.clip(inputs, -INPUT_CLIP, INPUT_CLIP, out=inputs)
 

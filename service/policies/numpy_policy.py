@@ -17,7 +17,6 @@ from service.base.types import FloatArray
 from service.envs.observations import ACTION, POSITIONS
 from service.policies import forward
 from service.policies.parameters import (
-    NUM_GOAL,
     Parameters,
     PolicyError,
     bob_shapes,
@@ -93,9 +92,13 @@ class NumpyMCPPolicy(NumpyPolicy):
         """P; the observation O is these and the goal."""
         self.num_primitives, head_size, _ = shape_of(parameters, "primitives.output_weight", 3)
         trunk, gate = (layer_sizes(parameters, name) for name in ("primitives.trunk.{}", "gate.hidden.{}"))
-        goal = slice(self.num_positions, self.num_positions + NUM_GOAL)
-        self.columns = {"positions": slice(0, self.num_positions), "object": POSITIONS["object"], "goal": goal}
-        expected = bob_shapes(self.num_positions, trunk, (self.num_primitives, head_size), gate)
+        (num_seen,) = shape_of(parameters, "gate.input.offset", 1)
+        self.num_goal = 3 * max(round((num_seen - self.num_positions) / 6), 1)
+        """3 for each object."""
+        first, goal = POSITIONS["object"].start, slice(self.num_positions, self.num_positions + self.num_goal)
+        of_objects = slice(first, first + self.num_goal)
+        self.columns = {"positions": slice(0, self.num_positions), "object": of_objects, "goal": goal}
+        expected = bob_shapes(self.num_positions, self.num_goal, trunk, (self.num_primitives, head_size), gate)
         self.network = forward.prepared(np, checked(parameters, expected))
 
     def primitives(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -114,7 +117,7 @@ class NumpyMCPPolicy(NumpyPolicy):
         Raises:
             PolicyError: the last axis is not O.
         """
-        rows = _rows(observation, self.num_positions + NUM_GOAL, "observation")
+        rows = _rows(observation, self.num_positions + self.num_goal, "observation")
         weights: FloatArray = forward.gate(np, self.network, self.columns, rows)
         return weights.reshape((*np.shape(observation)[:-1], self.num_primitives))
 

@@ -9,11 +9,10 @@ import numpy as np
 
 from service.base.errors import TandemError
 from service.base.types import FloatArray
-from service.envs.observations import ACTION, GOAL_FROM_OBJECT, PAPER
+from service.envs.observations import ACTION
 
 Parameters = Mapping[str, FloatArray]
 Shapes = dict[str, tuple[int, ...]]
-NUM_GOAL = PAPER.bob.size - PAPER.positions.size
 
 
 class PolicyError(TandemError):
@@ -22,6 +21,7 @@ class PolicyError(TandemError):
 
 def bob_shapes(
     num_positions: int,
+    num_goal: int,
     trunk: Sequence[int],
     heads: tuple[int, int],
     gate: Sequence[int],
@@ -30,12 +30,13 @@ def bob_shapes(
 
     Args:
         num_positions: P.
+        num_goal: 3 for each object.
         trunk: sizes of the layers that the primitives share.
         heads: number of primitives, and hidden size of each.
         gate: sizes of the gate's hidden layers.
     """
     num_primitives, head_size = heads
-    num_seen = num_positions + NUM_GOAL + GOAL_FROM_OBJECT.size
+    num_seen = num_positions + 2 * num_goal  # and the ways to the goals
     last_of_trunk, last_of_gate = [num_positions, *trunk][-1], [num_seen, *gate][-1]
     return {
         **_input_shapes("primitives.input", num_positions),

@@ -75,10 +75,12 @@ def model_card(manifest: Manifest, *, licence: str = LICENCE) -> str:
         "tags": [*tags, *(f"arxiv:{PAPERS[key][0]}" for key in papers)],
         **({"model-index": [{"name": manifest.name, "results": _model_index(rates)}]} if rates else {}),
     }
-    thing, robot = _at(config, "world", "object"), _at(config, "world", "robot")
+    things, robot = _at(config, "world", "objects") or [_at(config, "world", "object")], _at(config, "world", "robot")
     facts = {
         "robot": _at(robot, "name") or robot or "panda",
-        "object": _at(thing, "shape") if isinstance(thing, Mapping) else thing,
+        "objects" if len(things) > 1 else "object": ", ".join(
+            str(_at(thing, "shape") if isinstance(thing, Mapping) else thing) for thing in things
+        ),
         "simulator": "MuJoCo",
         **{name: f"{spaces[name]} numbers" for name in ("observation", "action") if isinstance(spaces.get(name), int)},
         "parameters": f"{sum(prod(each.shape) for each in manifest.tensors.values()):,}",

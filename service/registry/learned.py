@@ -9,39 +9,38 @@ from __future__ import annotations
 import numpy as np
 
 from service.base.types import FloatArray
-from service.envs.observations import GOAL_FROM_OBJECT, PAPER, POSITIONS, Layouts
+from service.envs.observations import PAPER, Layouts
 from service.policies import forward
 from service.policies.forward import INPUT_CLIP
 from service.policies.frozen_skills import FrozenSkills
-from service.policies.numpy_actor import NUM_MOTION_INPUTS, motion_inputs, numpy_actor
+from service.policies.numpy_actor import motion_inputs, moved_columns, numpy_actor
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.policies.parameters import Parameters, PolicyError
 
 RESIDUAL = 0.5
 """Size of the greatest action that a policy with a residual adds to the composition."""
-_GOAL = PAPER.bob["goal"]
-_GOAL_OFFSET, _GOAL_SCALE = PAPER.bob.normalisation.offset[_GOAL], PAPER.bob.normalisation.scale[_GOAL]
 Frozen = NumpyMCPPolicy | FrozenSkills | None
 """What a learned policy acts with: primitives, skills, or nothing."""
 
 
 def num_inputs(seen: Layouts) -> tuple[int, int]:
     """Numbers of ``motion_inputs`` alone, and of ``learner_inputs``: 17 and 23 in the paper's worlds."""
-    motion = NUM_MOTION_INPUTS + seen.positions.size - POSITIONS.size
-    return motion, motion + seen.bob.size - seen.positions.size + GOAL_FROM_OBJECT.size
+    motion = seen.positions.size + len(moved_columns(seen.positions))
+    return motion, motion + seen.gate.size - seen.positions.size
 
 
 def learner_inputs(previous: FloatArray, positions: FloatArray, goal: FloatArray, seen: Layouts = PAPER) -> FloatArray:
-    """(N, I) inputs of every downstream learner: those of ``motion_inputs``, the goal, and the way from the object.
+    """(N, I) inputs of every downstream learner: those of ``motion_inputs``, the goals, and the ways to them.
 
     Args:
         previous: (N, P) positions one step ago; at an episode's start those of now.
         positions: (N, P), metres.
-        goal: (N, 3), metres.
+        goal: (N, 3 K), metres.
         seen: layouts of the world.
     """
-    place = (goal - _GOAL_OFFSET) / _GOAL_SCALE
-    relative = (goal - positions[:, POSITIONS["object"]]) / GOAL_FROM_OBJECT.normalisation.scale
+    columns, usual = seen.bob["goal"], seen.bob.normalisation
+    place = (goal - usual.offset[columns]) / usual.scale[columns]
+    relative = (goal - positions[:, seen.positions["object"]]) / seen.way.normalisation.scale
     told = np.clip(np.concatenate((place, relative), axis=1), -INPUT_CLIP, INPUT_CLIP)
     motion = motion_inputs(previous, positions, seen.positions)
     inputs: FloatArray = np.concatenate((motion, told), axis=1, dtype=np.float32)

@@ -213,9 +213,33 @@ class Trained:
         """The same on a task, by its name or file, without Alice; None: as it is.
 
         Raises:
-            TandemError: no such task.
+            TandemError: no such task, or one of more or fewer objects.
         """
-        return self if task is None else replace(self, task=find_task(task), alice=None)
+        return self if task is None else self.playing(find_task(task))
+
+    def playing(self, task: Task) -> Trained:
+        """The same on a task, without Alice.
+
+        Raises:
+            TandemError: the task has more or fewer objects.
+        """
+        num, known = task.world_from(self.config.world).num_objects, self.config.world.num_objects
+        if num != known:
+            raise TandemError(
+                f"{self.label} was trained in a world of {known} object{'s' * (known > 1)}, and {task.title} has "
+                f"{num}: name what was trained in such a world"
+            )
+        return replace(self, task=task, alice=None)
+
+    def of_one_object(self, by: str) -> Trained:
+        """Itself, if it moves one object.
+
+        Raises:
+            TandemError: it moves several.
+        """
+        if (num := self.config.world.num_objects) > 1:
+            raise TandemError(f"{self.label} moves {num} objects; {by} knows one")
+        return self
 
     def expect(self, *kinds: Kind, by: str) -> Trained:
         """Itself, if it is of one of these kinds.

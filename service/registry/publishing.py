@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from service.actors.coverage import NUM_SKILLS, skill_paths, visited_share
-from service.actors.evaluation import EVALUATED_GOALS, REPORTED_SEED, success_metrics
+from service.actors.evaluation import REPORTED_SEED, evaluated_goals, success_metrics
 from service.base import tensors
 from service.base.errors import StorageError, TandemError
 from service.config import Config
@@ -41,7 +41,7 @@ def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
         found = success_metrics(
             numpy_bob(parameters),
             world,
-            EVALUATED_GOALS,
+            evaluated_goals(config.world),
             config.run.final_episodes,
             seed=REPORTED_SEED,
             num_threads=config.run.num_threads,

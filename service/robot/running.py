@@ -50,7 +50,7 @@ def for_robot(trained: Trained) -> Trained:
     Raises:
         TandemError: skills, a policy that composes nothing, or one of another robot.
     """
-    trained.expect("primitives", "orchestrator", by="tandem robot")
+    trained.expect("primitives", "orchestrator", by="tandem robot").of_one_object(by="tandem robot")
     if trained.kind == "orchestrator" and trained.trained is None:
         raise TandemError(f"{trained.label} acts without primitives; a bridge plays what composes them")
     check_robot(trained.trained or trained)

@@ -12,6 +12,7 @@ from service.base.errors import ConfigError
 from service.base.files import open_regular
 from service.base.parsing import ParseError, parse_json
 from service.config.tree import read_yaml
+from service.generator.records import of_furthest
 from service.status.schemas import GoalFrame, GoalFrames, RunCommand, RunLog, RunSetup
 from service.store.disk_reader import is_study
 from service.store.models import ACTIVE, OUTPUT_FILE, GoalGrid, RunStatus
@@ -105,7 +106,7 @@ def _frame(lines: list[bytes], lower: np.ndarray[Any, np.dtype[np.float64]], cel
     for line in lines:
         try:
             record = parse_json(line, "goals.jsonl")
-            goals = np.array(record["goals"], dtype=np.float64).reshape(-1, 7)
+            goals = of_furthest(record["goals"])
             steps.append(int(record["env_steps"]))
         except (ParseError, KeyError, TypeError, ValueError):
             continue

@@ -21,6 +21,9 @@ from tests.generator.outcomes import FREE, SOME_BLOCKED, make_states
 
 WORLD = WorldConfig(workspace=WorkspaceConfig(center_x_m=0.1, center_y_m=0.0))
 
+ARRANGED = np.zeros(0, dtype=np.int64)
+"""Of one object nothing is counted."""
+
 
 def make(cell_size_m: float = 0.05) -> DifficultyGrid:
     return DifficultyGrid(GoalCells(WORLD, cell_size_m))
@@ -29,8 +32,9 @@ def make(cell_size_m: float = 0.05) -> DifficultyGrid:
 def record(grid: DifficultyGrid, goals: list[tuple[float, ...]], solved: list[bool]) -> int:
     """Valid proposals that were all tried."""
     tried = np.array(goals, dtype=np.float64).reshape(-1, 3)
-    proposed = grid.cells.count(tried)
-    return grid.record(proposed, proposed, proposed, grid.cells.count(tried[np.array(solved, dtype=np.bool_)]))
+    proposed = grid.cells.count(grid.cells.index(tried))
+    successes = grid.cells.count(grid.cells.index(tried[np.array(solved, dtype=np.bool_)]))
+    return grid.record(proposed, proposed, proposed, successes, ARRANGED)
 
 
 def test_counts_by_hand() -> None:
@@ -79,14 +83,14 @@ def test_cells_cover_an_off_centre_workspace() -> None:
     goals = np.array(
         [[-0.075, -0.175, 0.0], [0.275, 0.175, 0.35], [-0.01, -0.17, 0.01], [-0.07, -0.12, 0.01], [-0.07, -0.17, 0.06]]
     )
-    assert cells.index(goals).tolist() == [0, 342, 49, 7, 1]
-    assert np.flatnonzero(cells.count(goals)).tolist() == [0, 1, 7, 49, 342]
-    assert cells.count(goals[[1, 1, 0]])[[0, 1, 342]].tolist() == [1, 0, 2]
+    assert cells.index(goals).ravel().tolist() == [0, 342, 49, 7, 1]
+    assert np.flatnonzero(cells.count(cells.index(goals))).tolist() == [0, 1, 7, 49, 342]
+    assert cells.count(cells.index(goals[[1, 1, 0]]))[[0, 1, 342]].tolist() == [1, 0, 2]
 
 
 def test_the_grid_of_what_is_shown() -> None:
     cells = make().cells
-    shown = np.flatnonzero(cells.count(np.array([(0.20, -0.17, 0.11)])))  # cell (5, 0, 2)
+    shown = np.flatnonzero(cells.count(cells.index(np.array([(0.20, -0.17, 0.11)]))))  # cell (5, 0, 2)
     numbers = np.arange(len(cells))
     grid = goal_grid(cells, shown, numbers, numbers / 1000, iteration=3, num_env_steps=40)
     (cell,) = grid.cells
@@ -95,7 +99,7 @@ def test_the_grid_of_what_is_shown() -> None:
     assert (grid.iteration, grid.num_env_steps, grid.cell_size_m, grid.shape) == (3, 40, 0.05, (7, 7, 7))
     assert grid.num_cells == 343
     assert (grid.lower_m, grid.upper_m) == (WORLD.workspace.lower_m, WORLD.workspace.upper_m)
-    assert np.array_equal(cells.index(cells.centers()), numbers)
+    assert np.array_equal(cells.index(cells.centers()).ravel(), numbers)
 
 
 def test_grid_rates_by_hand() -> None:
@@ -103,14 +107,15 @@ def test_grid_rates_by_hand() -> None:
     easy, hard, untried = (0.1, 0.1, 0.025), (0.1, -0.1, 0.2), (0.2, 0.0, 0.3)
     record(grid, [easy, hard], [True, False])
     goals = np.array([easy, hard, untried])
-    np.testing.assert_allclose(grid.counts.success_rate()[grid.cells.index(goals)], [2 / 3, 1 / 3, 1 / 2], rtol=1e-12)
-    learnability = grid.counts.learnability()[grid.cells.index(goals)]
+    cells = grid.cells.index(goals).ravel()
+    np.testing.assert_allclose(grid.counts.success_rate()[cells], [2 / 3, 1 / 3, 1 / 2], rtol=1e-12)
+    learnability = grid.counts.learnability()[cells]
     np.testing.assert_allclose(learnability, [2 / 9, 2 / 9, 1 / 4], rtol=1e-12)
     np.testing.assert_allclose(grid.mean_learnability(), 2 / 9, rtol=1e-12)
     np.testing.assert_allclose(grid.mean_success_rate(), (2 / 3 + 1 / 3) / len(grid.cells), rtol=1e-12)
     assert grid.num_cells_seen == 2
-    tries = grid.cells.count(np.array([untried]))  # a goal that nobody proposed
-    grid.record(np.zeros_like(tries), np.zeros_like(tries), tries, tries)
+    tries = grid.cells.count(grid.cells.index(np.array([untried])))  # a goal that nobody proposed
+    grid.record(np.zeros_like(tries), np.zeros_like(tries), tries, tries, ARRANGED)
     assert grid.num_cells_seen == 2
     np.testing.assert_allclose(grid.mean_success_rate(), (2 / 3 + 1 / 3 + 2 / 3) / len(grid.cells), rtol=1e-12)
 
@@ -122,9 +127,9 @@ def test_cells_near_those_that_were_reached() -> None:
     assert not grid.near_reached().any()
     corner, middle = none.copy(), none.copy()
     corner[0], middle[171] = 5, 1  # cells (0, 0, 0) and (3, 3, 3) of 7 x 7 x 7
-    grid.record(none, corner, none, none)
+    grid.record(none, corner, none, none, ARRANGED)
     assert np.flatnonzero(grid.near_reached()).tolist() == [0, 1, 7, 49]
-    grid.record(none, middle, none, none)
+    grid.record(none, middle, none, none, ARRANGED)
     around = [171 - 49, 171 - 7, 170, 171, 172, 171 + 7, 171 + 49]
     assert np.flatnonzero(grid.near_reached()).tolist() == [0, 1, 7, 49, *around]
     assert grid.num_cells_seen == 0  # no goal was proposed in any
@@ -137,10 +142,10 @@ def test_a_new_cell_is_counted_once_tried_or_not() -> None:
     grid = make()
     assert np.isnan(grid.mean_learnability())
     goals = np.array([[0.1, 0.1, 0.02], [0.1, 0.1, 0.03], [0.1, -0.1, 0.02]])
-    proposed, none = grid.cells.count(goals), np.zeros(len(grid.cells), dtype=np.int64)
-    assert grid.record(proposed, none, none, none) == 2
-    assert grid.record(proposed, none, none, none) == 0
-    assert grid.record(none, none, none, none) == 0
+    proposed, none = grid.cells.count(grid.cells.index(goals)), np.zeros(len(grid.cells), dtype=np.int64)
+    assert grid.record(proposed, none, none, none, ARRANGED) == 2
+    assert grid.record(proposed, none, none, none, ARRANGED) == 0
+    assert grid.record(none, none, none, none, ARRANGED) == 0
     assert grid.num_cells_seen == 2
     assert not grid.counts.num_tries.any()
 
@@ -148,11 +153,11 @@ def test_a_new_cell_is_counted_once_tried_or_not() -> None:
 def test_novelty_by_hand() -> None:
     grid = make()
     goals = np.array([[0.1, 0.1, 0.02]] * 3 + [[0.1, -0.1, 0.02]])
-    often, once, never = grid.cells.index(np.array([goals[0], goals[3], (0.2, 0.0, 0.3)]))
-    proposed, none = grid.cells.count(goals), np.zeros(len(grid.cells), dtype=np.int64)
-    grid.record(proposed, none, none, none)  # tried or not
+    often, once, never = grid.cells.index(np.array([goals[0], goals[3], (0.2, 0.0, 0.3)])).ravel()
+    proposed, none = grid.cells.count(grid.cells.index(goals)), np.zeros(len(grid.cells), dtype=np.int64)
+    grid.record(proposed, none, none, none, ARRANGED)  # tried or not
     np.testing.assert_allclose(grid.novelty()[[often, once, never]], [1 / 2, 0.5**0.5, 1.0], rtol=1e-15)
-    grid.record(none, none, none, none)
+    grid.record(none, none, none, none, ARRANGED)
     expected = 1.0 / (1.0 + PROPOSAL_DECAY * np.array([3.0, 1.0])) ** 0.5
     np.testing.assert_allclose(grid.novelty()[[often, once]], expected, rtol=1e-15)
 

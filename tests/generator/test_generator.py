@@ -286,7 +286,7 @@ def test_reached_goals_are_drawn_where_an_object_was_and_beside() -> None:
     choice = choose(generator, [OUTSIDE] * 400)
     assert choice.replayed.all()
     goals = np.concatenate([choose(generator, [OUTSIDE] * 400, seed=seed).goal for seed in range(20)])
-    drawn = np.unique(generator.cells.index(goals))
+    drawn = np.unique(generator.cells.index(goals).ravel())
     assert drawn.tolist() == np.flatnonzero(generator.grid.near_reached()).tolist()
     assert len(drawn) == 6  # at the workspace's edge
 
@@ -403,7 +403,7 @@ def test_record_separates_who_learns_what() -> None:
     assert metrics["bob/success_rate_replayed"] == 0.0
     # The current Bob tried the first cell three times and the past Alice's once; the past Bob's try does not count.
     goals = np.array([(-0.2, 0.0, 0.02), (-0.1, 0.0, 0.02), (0.0, 0.1, 0.02), (0.1, 0.1, 0.02)])
-    rates = generator.grid.counts.success_rate()[generator.cells.index(goals)]
+    rates = generator.grid.counts.success_rate()[generator.cells.index(goals).ravel()]
     tries = remembered(3)
     np.testing.assert_allclose(rates, [(tries / 3 + 1) / (tries + 2), 2 / 3, 1 / 2, 1 / 2])
     expected = float(np.mean([rate * (1 - rate) for rate in ((tries / 3 + 1) / (tries + 2), 1 / 3, 1 / 2, 1 / 2)]))

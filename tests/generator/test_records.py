@@ -31,15 +31,15 @@ from tests.generator.outcomes import SOME_BLOCKED, make_records, make_starts, ma
 
 CONFIG = parse_config({"game": {"blocked_gripper_fraction": 0.2}}, where="test")
 CELLS, TASKS = GoalCells(CONFIG.world, CONFIG.generator.cell_size_m), TaskBins(CONFIG, SOME_BLOCKED)
-REST = 0.025
+WORLD = CONFIG.world
 
 
 def alice_metrics(records: GoalRecords) -> Metrics:
-    return means(alice_sums(records, REST))
+    return means(alice_sums(records, WORLD))
 
 
 def bob_metrics(records: GoalRecords) -> Metrics:
-    return means(bob_sums(records, REST))
+    return means(bob_sums(records, WORLD))
 
 
 def test_metrics_of_six_worlds_by_hand() -> None:
@@ -117,15 +117,15 @@ def test_fallen_proposals_may_be_not_a_number() -> None:
 def test_the_height_up_to_which_nine_of_ten_lie() -> None:
     heights = [0.0254, *[0.1003] * 8, 0.2996]  # nine of ten are no higher than 0.1003
     records = make_records([(0.1, 0.0, height) for height in heights])
-    counted = count_heights(records)
+    counted = count_heights(records, WORLD)
     assert {int(step): int(counted[step]) for step in np.flatnonzero(counted)} == {25: 1, 100: 8, 299: 1}
     assert height_percentile(counted, 90.0) == pytest.approx(0.1005)  # the middle of its millimetre
     assert height_percentile(counted, 91.0) == pytest.approx(0.2995)
-    assert np.isnan(height_percentile(count_heights(make_records([])), 90.0))
+    assert np.isnan(height_percentile(count_heights(make_records([]), WORLD), 90.0))
     past = make_records([(0.1, 0.0, 0.2)] * 2, alice_past=[True, False], verdict=np.array([0, 1], dtype=np.int8))
-    assert not count_heights(past).any()
+    assert not count_heights(past, WORLD).any()
     # the upper face of the highest workspace there may be, and what is nowhere in it
-    outermost = count_heights(make_records([(0.0, 0.0, 0.8), (0.0, 0.0, 0.9), (0.0, 0.0, -0.1)]))
+    outermost = count_heights(make_records([(0.0, 0.0, 0.8), (0.0, 0.0, 0.9), (0.0, 0.0, -0.1)]), WORLD)
     assert np.flatnonzero(outermost).tolist() == [0, 800]
     assert len(outermost) == 801
 
@@ -163,7 +163,7 @@ def test_no_goals_and_very_many() -> None:
 
 def at(*goals: tuple[float, ...]) -> list[int]:
     """Cells of goals."""
-    return CELLS.index(np.array(goals)).tolist()
+    return CELLS.index(np.array(goals)).ravel().tolist()
 
 
 def counted(counts: np.ndarray) -> dict[int, int]:
@@ -323,6 +323,7 @@ def test_random_numbers_are_left_alone_where_nothing_is_left_out(
     records = make_records([(0.1, 0.0, 0.025)] * 5, round_index=[0, 0, 1, 1, 1])
     starts = make_starts(make_states(5, SOME_BLOCKED, held=True))
     rng, same = np.random.default_rng(3), np.random.default_rng(3)
-    reached = CELLS.count(records.proposal)
-    summarize(records, starts, reached, CELLS, TASKS, max_goals=max_goals, max_starts=max_starts, rng=rng)
+    reached = CELLS.count(CELLS.index(records.proposal))
+    limits = {"max_goals": max_goals, "max_starts": max_starts}
+    summarize(records, starts, reached, starts["start_position"], CELLS, TASKS, **limits, rng=rng)
     assert (rng.bit_generator.state == same.bit_generator.state) is untouched

@@ -52,6 +52,15 @@ def test_it_computes_what_the_trained_one_did(name, before, after):
     torch.testing.assert_close(outputs(new, wider), outputs(trained, rows))
 
 
+def test_policies_of_two_objects():
+    two, wider = Layouts(num_objects=2), Layouts(num_commands=2, num_objects=2)
+    torch.manual_seed(0)
+    trained = networks.export_parameters(networks.make_bob(SMALL, two))
+    assert take_over(networks.make_bob(SMALL, wider), trained, two.bob, wider.bob) == "taken: new command_1, command_2"
+    said = take_over(networks.make_bob(SMALL, PAPER), trained, two.bob, PAPER.bob)
+    assert said == "not taken, it was trained with 2 objects, here is 1"
+
+
 def test_inputs_that_are_gone_are_left_out():
     torch.manual_seed(0)
     trained, new = networks.make_bob(SMALL, WIDER), networks.make_bob(SMALL, PAPER)

@@ -134,7 +134,7 @@ def test_played_before_lifted_before_far():
     start = np.tile([0.0, 0.0, 0.025], (4, 1))
     goal = start + np.array([[0.30, 0, 0], [0.12, 0, 0.06], [0.20, 0, 0], [0.50, 0, 0.10]])
     records = SimpleNamespace(start_position=start, goal=goal, played=np.array([True, True, True, False]))
-    interest = list(recording._interest(records, 0.025))
+    interest = list(recording._interest(records, WorldConfig()))
     assert sorted(range(4), key=interest.__getitem__, reverse=True) == [1, 0, 2, 3]
 
 

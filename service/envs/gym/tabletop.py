@@ -15,7 +15,7 @@ from service.base.errors import TandemError, in_metres
 from service.base.types import BoolArray, FloatArray, StateArray
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.observations import ACTION, layouts
+from service.envs.observations import ACTION, each_object, layouts
 from service.envs.rules import Rules
 from service.envs.sampling import inside_fixtures
 from service.envs.task import Task, View, view_of_places
@@ -37,7 +37,7 @@ class EnvState:
     worlds: StateArray
     """(N, S) ``WorldBatch.states``."""
     goal: StateArray
-    """(N, 3) metres."""
+    """(N, 3 K) metres."""
     elapsed: NDArray[np.int64]
     """(N,) steps of the episode."""
     memory: StateArray
@@ -78,7 +78,7 @@ class GoalWorlds:
         self._random = [seeding.np_random()[0] for _ in range(num_worlds)]
 
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
-        """Reward of (..., 3) achieved for (..., 3) desired goals, metres: (...) float64, 1 where reached, else 0.
+        """Reward of (..., 3 K) achieved for (..., 3 K) desired goals, metres: (...) float64, 1 where reached, else 0.
 
         ``info`` is there for the convention of goal environments and is not read.
 
@@ -86,12 +86,12 @@ class GoalWorlds:
             TandemError: the task needs more than places, or gives something else.
         """
         achieved, desired = np.broadcast_arrays(achieved_goal, desired_goal)
-        flat = achieved.reshape(-1, 3), desired.reshape(-1, 3)
+        flat = (each.reshape(-1, each.shape[-1]) for each in (achieved, desired))
         return self.rules.reward(view_of_places(*flat)).reshape(achieved.shape[:-1])
 
     def rewards_of(self, rows: FloatArray, goal: FloatArray) -> NDArray[np.float64]:
-        """(B,) rewards for steps that led to (B, V) ``View.rows``, had the goals (B, 3) been others, metres."""
-        return self.rules.reward(View.of_rows(rows, goal[:, None]))
+        """(B,) rewards for steps that led to (B, V) ``View.rows``, had the goals (B, 3 K) been others, metres."""
+        return self.rules.reward(View.of_rows(rows, each_object(goal)))
 
     def state(self) -> EnvState:
         """Copy everything that :meth:`restore` needs."""
@@ -122,7 +122,7 @@ class GoalWorlds:
 
         Args:
             worlds: (N,) where.
-            goal: (N, 3) in place of random goals, metres; random numbers go on as with these.
+            goal: (N, 3 K) in place of random goals, metres; random numbers go on as with these.
         """
         index = np.flatnonzero(worlds).tolist()
         starts = [self._worlds.draw_starts(self._random[world], 1) for world in index]
@@ -135,7 +135,7 @@ class GoalWorlds:
             self._goal[:] = goal
 
     def _given(self, options: dict[str, Any] | None) -> StateArray | None:
-        """(N, 3) or (1, 3) goals that ``options`` of a reset give, metres; None where they give none.
+        """(N, 3 K) or (1, 3 K) goals that ``options`` of a reset give, metres; None where they give none.
 
         Raises:
             TandemError: another option, or a goal of another shape, out of reach or inside a fixture.
@@ -144,10 +144,12 @@ class GoalWorlds:
             raise TandemError(f"reset: unknown option {name!r}; the only one is goal")
         if not options or options["goal"] is None:
             return None
-        goal, num = np.array(options["goal"], dtype=np.float64), self._worlds.num_worlds
-        if goal.shape not in ((3,), (num, 3)):
-            raise TandemError(f"reset: options['goal'] has shape {goal.shape}, not (3,) or {(num, 3)}: give metres")
-        goal = goal.reshape(-1, 3)
+        goal, num, size = np.array(options["goal"], dtype=np.float64), self._worlds.num_worlds, self._goal.shape[1]
+        if goal.shape not in ((size,), (num, size)):
+            raise TandemError(
+                f"reset: options['goal'] has shape {goal.shape}, not {(size,)} or {(num, size)}: give metres"
+            )
+        goal = goal.reshape(-1, size)
         for bad in goal[self.rules.out_of_reach(goal)]:
             near = in_metres(self.rules.nearest(bad[None])[0])
             raise TandemError(
@@ -178,7 +180,8 @@ class GoalWorlds:
 
 def goal_space(config: WorldConfig) -> gymnasium.spaces.Dict:
     """Make the space of the observations of one such world."""
-    sizes = {"observation": layouts(config).positions.size, "achieved_goal": 3, "desired_goal": 3}
+    goal = 3 * config.num_objects
+    sizes = {"observation": layouts(config).positions.size, "achieved_goal": goal, "desired_goal": goal}
     return gymnasium.spaces.Dict(
         {name: gymnasium.spaces.Box(-_FURTHEST_M, _FURTHEST_M, (size,), np.float32) for name, size in sizes.items()}
     )
@@ -190,15 +193,15 @@ def action_space() -> gymnasium.Space[FloatArray]:
 
 
 class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
-    """A Panda at a table, one rigid object, and a goal for the object's centre.
+    """A robot at a table, K rigid objects, one in most worlds, and a goal for each object's centre.
 
     - observation: ``observation`` (P,) positions as Bob's primitives see them (``service.envs.observations``), 11 or as
-      many as ``config.observed`` says, ``achieved_goal`` (3,) and ``desired_goal`` (3,) object and goal in the world
+      many as ``config`` says, ``achieved_goal`` (3 K,) and ``desired_goal`` (3 K,) objects and goals in the world
       frame, metres, within +-10.
     - action: (4,) in [-1, 1]: way x, y, z from where the end effector is now to its set-point (1 is 5 cm, of which the
       arm covers about 3 cm in a step), change of the finger width (1 is 10 cm).
-    - reward: 1 at every step the object is within ``success_distance_m`` of the goal, else 0 (paper, downstream tasks);
-      or what the task says.
+    - reward: 1 at every step each object is within ``success_distance_m`` of its goal, else 0 (paper, downstream
+      tasks); or what the task says.
     - never terminates; truncated where the physics diverged, or the steps of the task are over. For others than
       these: ``task=replace(find_task("push"), episode_steps=100)``.
 

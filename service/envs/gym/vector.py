@@ -68,8 +68,8 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
 
         Args:
             seed: world i draws its episodes from ``seed + i``, or ``seed[i]``; None goes on with the random numbers.
-            options: ``{"goal": ...}``, (3,) one for all worlds or (N, 3), metres, in place of the random goals of these
-                episodes; those that begin on their own have random ones again.
+            options: ``{"goal": ...}``, (3 K,) one for all worlds or (N, 3 K), metres, in place of the random goals of
+                these episodes; those that begin on their own have random ones again.
 
         Raises:
             ValueError: not one seed per world.

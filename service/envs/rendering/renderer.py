@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from service.base.types import StateArray
 from service.config import WorldConfig
+from service.config.objects import Color
 from service.envs.objects import geometry
+from service.envs.observations import each_object
 from service.envs.rendering.camera import DEFAULT_VIEW, View
 from service.envs.rendering.decoration import decorate
 from service.envs.rendering.gl import RenderError, open_drawing
@@ -53,8 +55,8 @@ class SceneRenderer:
         self.model = _build_model(config, width, height)
         self._data = mujoco.MjData(self.model)
         self._layout = build_layout(config)  # the flag of a blocked gripper follows everything that is read here
-        self._rest_height_m = config.rest_height_m
-        self._goal, self._color = geometry(config.shape), goal_color(config.shape.color)
+        colors = goal_colors([body.color for body in config.bodies])
+        self._goals = list(zip(map(geometry, config.bodies), config.rest_heights_m, colors, strict=True))
         self._rectangle = mujoco.MjrRect(0, 0, width, height)
         self._option = mujoco.MjvOption()
         self._scene = mujoco.MjvScene(self.model, maxgeom=_MAX_GEOMS)
@@ -80,7 +82,7 @@ class SceneRenderer:
 
         Args:
             state: (S,) row of ``WorldBatch.states``.
-            goal: (3,) metres, shown as a transparent copy of the object in another colour; None for none.
+            goal: (3 K,) metres, shown as transparent copies of the objects; None for none.
             size: width and height of this picture, pixels, at most those of the renderer; None for those.
 
         Returns:
@@ -95,7 +97,8 @@ class SceneRenderer:
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self.model, self._data, self._option, None, self.camera, everything, self._scene)
         if goal is not None:
-            self._add_goal(np.asarray(goal, dtype=np.float64))
+            for place, (shape, rest_height_m, color) in zip(each_object(np.asarray(goal)), self._goals, strict=True):
+                self._add_goal(np.asarray(place, dtype=np.float64), shape, rest_height_m, color)
         self._context.make_current()
         rectangle = self._rectangle if size is None else mujoco.MjrRect(0, 0, *size)
         image = np.empty((rectangle.height, rectangle.width, 3), dtype=np.uint8)
@@ -103,23 +106,29 @@ class SceneRenderer:
         mujoco.mjr_readPixels(image, None, rectangle, self._drawing)
         return np.ascontiguousarray(image[::-1])
 
-    def _add_goal(self, goal: StateArray) -> None:
-        """Add a transparent copy of the object, and a line down to the table, which shows its height."""
-        kind, size, quaternion = self._goal
+    def _add_goal(self, goal: StateArray, shape: Any, rest_height_m: float, color: Color) -> None:
+        """Add a transparent copy of an object, and a line down to the table, which shows its height."""
+        kind, size, quaternion = shape
         turned = np.empty(9)
         mujoco.mju_quat2Mat(turned, np.array(quaternion))
-        self._add(kind, size, goal, _GOAL_ALPHA, turned)
+        self._add(kind, size, goal, (*color, _GOAL_ALPHA), turned)
         cylinder, foot = mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([goal[0], goal[1], 0.0])
-        self._add(cylinder, (_FOOT_RADIUS_M, _FOOT_HALF_HEIGHT_M, 0.0), foot, _DROP_ALPHA)
-        half_drop = (goal[2] - self._rest_height_m) / 2
+        self._add(cylinder, (_FOOT_RADIUS_M, _FOOT_HALF_HEIGHT_M, 0.0), foot, (*color, _DROP_ALPHA))
+        half_drop = (goal[2] - rest_height_m) / 2
         if half_drop > _FOOT_HALF_HEIGHT_M:
             middle = np.array([goal[0], goal[1], half_drop])
-            self._add(cylinder, (_DROP_RADIUS_M, half_drop, 0.0), middle, _DROP_ALPHA)
+            self._add(cylinder, (_DROP_RADIUS_M, half_drop, 0.0), middle, (*color, _DROP_ALPHA))
 
-    def _add(self, kind: Any, size: Any, position: StateArray, alpha: float, turned: StateArray = _NOT_TURNED) -> None:
+    def _add(
+        self,
+        kind: Any,
+        size: Any,
+        position: StateArray,
+        rgba: tuple[float, float, float, float],
+        turned: StateArray = _NOT_TURNED,
+    ) -> None:
         geom = self._scene.geoms[self._scene.ngeom]
-        rgba = np.array((*self._color, alpha), dtype=np.float32)
-        mujoco.mjv_initGeom(geom, kind, np.asarray(size), position, turned, rgba)
+        mujoco.mjv_initGeom(geom, kind, np.asarray(size), position, turned, np.array(rgba, dtype=np.float32))
         geom.category, geom.castshadow = mujoco.mjtCatBit.mjCAT_DECOR, 0
         geom.emission, geom.specular = 0.25, 0.2
         self._scene.ngeom += 1
@@ -135,9 +144,11 @@ def _build_model(config: WorldConfig, width: int, height: int) -> mujoco.MjModel
     return spec.compile()
 
 
-def goal_color(color: Sequence[float]) -> tuple[float, float, float]:
-    """Red, green and blue of the goal of an object: green, or orange where the object is nearer to green.
+def goal_colors(colors: Sequence[Color]) -> Sequence[Color]:
+    """Colors of the goals of objects: of several their own; of one green, or orange where it is nearer to green.
 
     Both are Okabe and Ito's, which colour-blind readers tell apart.
     """
-    return max(_GOAL_COLORS, key=lambda goal: math.dist(goal, color))
+    if len(colors) > 1:
+        return colors
+    return [max(_GOAL_COLORS, key=lambda goal: math.dist(goal, color)) for color in colors]

@@ -14,10 +14,10 @@ from service.base.errors import TandemError
 from service.base.types import FloatArray, StateArray
 from service.config.self_play import GameConfig, SelfPlayConfig
 from service.envs.batch import WorldBatch
-from service.envs.observations import bob_observation
+from service.envs.observations import bob_observation, distances, each_object
 from service.envs.rules import Rules
 from service.envs.sampling import inside_fixtures
-from service.generator.validity import FALLEN_BELOW_M, Verdict, classify_goal
+from service.generator.validity import FALLEN_BELOW_M, Verdict, classify_goal, proposed
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.registry.loading import Trained
 
@@ -60,8 +60,8 @@ class Game:
         """(K,) of the primitives, where they are set."""
         self.caption = ""
         """What goes on, in a few words."""
-        self.goal: StateArray = np.zeros(3)
-        """(3,) metres."""
+        self.goal: StateArray = np.zeros(3 * self.world.num_objects)
+        """(3 K,) metres."""
         self.num_steps = 0
         """Since the game was made."""
         self._turn: Literal["alice", "bob"] = "bob"
@@ -143,13 +143,13 @@ class Game:
             self._begin_turn("bob")
 
     def set_goal(self, goal: StateArray) -> None:
-        """Put the goal at (3,) metres, or the nearest place in the workspace; Bob goes there and stays, or tries again.
+        """Put goals at (3 K,) metres, or the nearest place in the workspace; Bob goes there and stays, or tries again.
 
-        Where the object would be inside a fixture there is no goal: it stays where it was.
+        Where an object would be inside a fixture there is no goal: it stays where it was.
         """
         workspace = self.world.workspace
-        low = (*workspace.lower_m[:2], self.world.rest_height_m)
-        place = np.clip(np.asarray(goal, dtype=np.float64), low, workspace.upper_m)
+        low = [(*workspace.lower_m[:2], height) for height in self.world.rest_heights_m]
+        place = np.clip(each_object(np.asarray(goal, dtype=np.float64)), low, workspace.upper_m).ravel()
         if inside_fixtures(place[None], self.world)[0]:
             return
         self.goal = place
@@ -170,7 +170,7 @@ class Game:
         diverged = bool(self.worlds.step(self._action())[0])
         self._rules.advance(self.goal[None])
         self._steps += 1
-        if diverged or self.worlds.object_position[0, 2] < FALLEN_BELOW_M:
+        if diverged or each_object(self.worlds.object_position[0])[:, 2].min() < FALLEN_BELOW_M:
             self._pause("the object fell off the table" if not diverged else "the physics diverged", "reset")
         elif self._turn == "alice":
             self.caption = f"Alice proposes: {self._seconds()}"
@@ -192,7 +192,7 @@ class Game:
         return self.players.act_deterministic(bob_observation(worlds.positions(), self.goal[None]))
 
     def _follow_bob(self) -> None:
-        distance_m = float(np.linalg.norm(self.worlds.object_position[0] - self.goal))
+        distance_m = float(distances(self.worlds.object_position, self.goal[None]).max())
         there, own = bool(self._rules.solved(self.goal[None])[0]), self._rules.task.success is not None
         self._held = self._held + 1 if there else 0
         self.caption = f"On the way: {self._seconds()}"
@@ -214,9 +214,9 @@ class Game:
 
     def _judge(self) -> None:
         """Take where Alice left the object for a goal, or say why it is none."""
-        self._end_state, self.goal = self.worlds.states.copy(), self.worlds.object_position[0].copy()
-        before, workspace = self._start[:, self.worlds.layout["object"]], self.world.workspace
-        verdict = Verdict(classify_goal(before, self.goal[None], workspace, self.players.success_distance_m)[0])
+        near_m, end = self.players.success_distance_m, self.worlds.object_position.copy()
+        verdict = Verdict(classify_goal(self._start_position, end, self.world.workspace, near_m)[0])
+        self._end_state, self.goal = self.worlds.states.copy(), proposed(self._start_position, end, near_m)[0]
         if verdict == Verdict.VALID:
             self._pause("Alice proposed this goal", "bob")
         else:
@@ -240,7 +240,7 @@ class Game:
     def _begin_turn(self, turn: Literal["alice", "bob"], *, forget: bool = True) -> None:
         """Begin a turn; ``forget`` where the world has jumped, or another policy acted."""
         self._turn, self._steps, self._held, self._still_steps = turn, 0, 0, 0
-        self._start = self.worlds.states.copy()
+        self._start, self._start_position = self.worlds.states.copy(), self.worlds.object_position.copy()
         self.caption = "Alice proposes" if turn == "alice" else "On the way"
         self._rules.begin(np.ones(1, dtype=bool))
         if forget:

@@ -15,9 +15,11 @@ import numpy as np
 
 from service.base.types import StateArray
 from service.config import WorldConfig
+from service.envs.objects import object_names
+from service.envs.observations import each_object
 from service.envs.rendering.camera import DEFAULT_VIEW
 from service.envs.rendering.decoration import decorate
-from service.envs.rendering.renderer import goal_color
+from service.envs.rendering.renderer import goal_colors
 from service.envs.scene import build_layout, build_spec
 from service.robot.play.following import Learning
 from service.robot.play.game import Game, Mode
@@ -58,27 +60,31 @@ class LiveScene:
         self._scene = ViserMujocoScene(server, self.model, num_envs=1)
         self._scene.camera_tracking_enabled = False
         self._server = server
-        rest = world.rest_height_m
-        low, high = (*world.workspace.lower_m[:2], rest), world.workspace.upper_m
-        self.goal = server.scene.add_transform_controls(
-            "/goal",
-            scale=_HANDLE_M,
-            disable_rotations=True,
-            disable_sliders=True,
-            depth_test=False,
-            translation_limits=tuple(zip(low, high, strict=True)),
-        )
-        """The handle of the goal; its ``position`` is where a user dragged it."""
-        geoms = [geom for geom in range(self.model.ngeom) if self.model.geom(geom).name.startswith("object")]
-        shape = merge_geoms(self.model, geoms)
-        server.scene.add_mesh_simple(
-            "/goal/shape",
-            np.asarray(shape.vertices, dtype=np.float32),
-            np.asarray(shape.faces, dtype=np.uint32),
-            color=goal_color(world.shape.color),
-            opacity=_GOAL_OPACITY,
-            cast_shadow=False,
-        )
+        self.goals = []
+        """The handles of the objects' goals; the ``position`` of each is where a user dragged it."""
+        colors = goal_colors([body.color for body in world.bodies])
+        for name, rest, color in zip(object_names(world), world.rest_heights_m, colors, strict=True):
+            low, high = (*world.workspace.lower_m[:2], rest), world.workspace.upper_m
+            place = name.replace("object", "/goal")
+            handle = server.scene.add_transform_controls(
+                place,
+                scale=_HANDLE_M,
+                disable_rotations=True,
+                disable_sliders=True,
+                depth_test=False,
+                translation_limits=tuple(zip(low, high, strict=True)),
+            )
+            self.goals.append(handle)
+            body = self.model.body(name)
+            shape = merge_geoms(self.model, [int(body.geomadr[0]) + index for index in range(int(body.geomnum[0]))])
+            server.scene.add_mesh_simple(
+                f"{place}/shape",
+                np.asarray(shape.vertices, dtype=np.float32),
+                np.asarray(shape.faces, dtype=np.uint32),
+                color=color,
+                opacity=_GOAL_OPACITY,
+                cast_shadow=False,
+            )
         server.initial_camera.position = DEFAULT_VIEW.position_m
         server.initial_camera.look_at = DEFAULT_VIEW.lookat_m
         server.initial_camera.fov = _FIELD_OF_VIEW_RAD
@@ -100,12 +106,18 @@ class LiveScene:
         mujoco.mj_kinematics(self.model, self._data)
         self._scene.update_from_mjdata(self._data)
 
+    @property
+    def goal(self) -> StateArray:
+        """(3 K,) where the goals are, metres, or where a user dragged them."""
+        return np.concatenate([handle.position for handle in self.goals])
+
     def place_goal(self, goal: StateArray, *, visible: bool) -> None:
-        """Show the goal at (3,) metres, or nowhere."""
-        if not np.allclose(self.goal.position, goal, atol=1e-6):
-            self.goal.position = tuple(goal)
-        if self.goal.visible != visible:
-            self.goal.visible = visible
+        """Show the goals at (3 K,) metres, or nowhere."""
+        for handle, place in zip(self.goals, each_object(goal), strict=True):
+            if not np.allclose(handle.position, place, atol=1e-6):
+                handle.position = tuple(place)
+            if handle.visible != visible:
+                handle.visible = visible
 
 
 class Panel:

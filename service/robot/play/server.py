@@ -14,6 +14,7 @@ import numpy as np
 
 from service.base import ports
 from service.base.errors import TandemError, needs_extra
+from service.envs.objects import object_names
 from service.registry.loading import Trained
 from service.robot.play.following import Following
 from service.robot.play.game import Game
@@ -112,12 +113,12 @@ class LiveWorld:
         if asked or moved or dragged or not panel.paused:
             self.scene.draw(self._before, game.state, 1.0 if panel.paused else self._progress)
         self.scene.place_goal(game.goal, visible=game.shows_goal)
-        self._shown_goal = np.array(self.scene.goal.position)
+        self._shown_goal = self.scene.goal
         panel.show()
 
     def _take_dragged_goal(self) -> bool:
         """Give the game the goal where a user has put it."""
-        position = np.array(self.scene.goal.position)
+        position = self.scene.goal
         if self._shown_goal is None or np.allclose(position, self._shown_goal, atol=1e-6) or not self.game.shows_goal:
             return False
         if self.game.mode == "goals":
@@ -127,9 +128,9 @@ class LiveWorld:
 
 def _has_jumped(before: Any, after: Any, game: Game) -> bool:
     """Whether a world was put elsewhere: what lies between is not to be shown."""
-    place = game.worlds.layout["object"]
-    joints = game.worlds.layout["joints"]
-    far_m, far_rad = np.abs(after[place] - before[place]).max(), np.abs(after[joints] - before[joints]).max()
+    layout = game.worlds.layout
+    far_m = max(np.abs(after[layout[name]] - before[layout[name]]).max() for name in object_names(game.world))
+    far_rad = np.abs(after[layout["joints"]] - before[layout["joints"]]).max()
     return bool(far_m > 0.15 or far_rad > 0.6)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from service.base.errors import TandemError
 from service.envs.rendering.camera import VIEWS, parse_view
-from service.envs.rendering.renderer import goal_color
+from service.envs.rendering.renderer import goal_colors
 
 
 def test_what_is_typed():
@@ -31,6 +31,6 @@ def test_the_place_of_a_camera_is_mujocos(name):
 
 
 def test_the_goal_of_a_green_object_is_not_green():
-    red, green = goal_color((0.8, 0.1, 0.1)), goal_color((0.0, 0.7, 0.4))
+    (red,), (green,) = goal_colors([(0.8, 0.1, 0.1)]), goal_colors([(0.0, 0.7, 0.4)])
     assert red[1] > red[0]
     assert green[0] > green[1]

@@ -44,14 +44,14 @@ def test_a_dragged_goal_is_where_bob_goes(live):
     """The handle is what a browser moves; the loop reads it."""
     for _ in range(3):
         live.tick(0.04)
-    live.scene.goal.position = (0.12, 0.1, 0.2)
+    live.scene.goals[0].position = (0.12, 0.1, 0.2)
     for _ in range(75):
         live.tick(0.04)
     np.testing.assert_allclose(live.game.goal, (0.12, 0.1, 0.2))
     assert np.linalg.norm(object_of(live) - (0.12, 0.1, 0.2)) < 0.05
-    live.scene.goal.position = (3.0, 0.0, 0.2)
+    live.scene.goals[0].position = (3.0, 0.0, 0.2)
     live.tick(0.0)
-    assert live.scene.goal.position[0] == pytest.approx(live.game.world.workspace.upper_m[0])
+    assert live.scene.goals[0].position[0] == pytest.approx(live.game.world.workspace.upper_m[0])
 
 
 def test_time_goes_as_fast_as_is_asked(live):
@@ -87,7 +87,7 @@ def test_what_a_person_sets_is_done_between_two_steps(live):
     live.tick(0.0)
     assert game.mode == "primitives"
     assert not panel.weights[0].disabled
-    assert not live.scene.goal.visible
+    assert not live.scene.goals[0].visible
     panel.weights[0].value = 0.77
     panel._asking(lambda value: panel._take_weights())(Event(panel.weights[0], client=object()))
     live.tick(0.04)
@@ -98,7 +98,7 @@ def test_what_a_person_sets_is_done_between_two_steps(live):
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on PATH; on Debian: apt-get install chromium")
 def test_a_browser_shows_and_drives_it(live):
     """The shapes are hidden: without a graphics card a browser draws one picture of them in seconds."""
-    live.scene._scene.fixed_bodies_frame.visible = live.scene.goal.visible = False
+    live.scene._scene.fixed_bodies_frame.visible = live.scene.goals[0].visible = False
     for group in live.scene._scene._mesh_groups:
         group.handle.visible = False
     live._server.scene.configure_default_lights(True, cast_shadow=False)

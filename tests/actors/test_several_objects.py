@@ -1,0 +1,167 @@
+"""The game with two cubes: what is paid, goals that span two rounds, and runs that go on bit for bit."""
+
+import numpy as np
+import pytest
+
+from service.actors.self_play import SPANNING_SHARE, SelfPlay
+from service.config import parse_config
+from service.envs.observations import distances, each_object
+from service.generator.validity import Verdict
+from service.learner.samples import exchange, exchange_at_random
+from tests.actors.players import Noise, alices_own, assert_same_rollout, given, make_config, play
+from tests.runs.runs import TREE, assert_same_run
+from tests.runs.runs import play as run
+
+TWO = {"objects": ["cube", "cube"], "physics_step_s": 0.004, "num_substeps": 10}
+RED, BLUE = (-0.15, 0.1, 0.025), (0.05, -0.1, 0.025)
+
+
+def make_game(num_worlds=1, *, seed=0, places=(RED, BLUE), **game):
+    config = make_config(num_worlds, game={"bob_all_reward": 5.0, **game}, world=TWO)
+    made = SelfPlay(config, np.random.default_rng(seed), num_threads=1)
+    if places is not None:
+        states, layout = made.worlds.states.copy(), made.worlds.layout
+        states[:, layout["object"]], states[:, layout["object_2"]] = places
+        made.worlds.restore(states)
+    return made
+
+
+def slides(game, name, speed_m_s):
+    """Let an object slide along x: with friction 1 it goes v^2 / (2 g)."""
+    states, first = game.worlds.states.copy(), game.worlds.layout[f"{name}_velocity"].start
+    states[:, first] = speed_m_s
+    game.worlds.restore(states)
+
+
+def paid(game, goal):
+    return play(game, choose_goals=given(np.array(goal))).bob.reward[:, 0].tolist()
+
+
+def test_what_lies_at_its_goal_at_the_start_pays_nothing_until_it_leaves():
+    far = (0.1, 0.1, 0.025)
+    game = make_game()
+    assert paid(game, [*RED, *far]) == [0.0] * 7
+    slides(game := make_game(), "object", 1.5)  # 11 cm: red leaves its goal
+    assert sorted(paid(game, [*RED, *far])) == [-1.0] + [0.0] * 6
+
+
+def test_each_that_comes_pays_and_all_pay_more():
+    slides(game := make_game(), "object_2", 1.0)  # 5 cm
+    goal = [*RED, BLUE[0] + 0.08, *BLUE[1:]]
+    rewards = paid(game, goal)
+    assert sorted(rewards) == [*[0.0] * (len(rewards) - 1), 1.0 + 5.0]
+    slides(game := make_game(bob_all_reward=0.0), "object_2", 1.0)
+    assert sorted(paid(game, goal))[-1] == 1.0
+
+
+def test_where_all_are_there_the_turn_is_paid_as_ever():
+    rollout = play(make_game(bob_hold_steps=2), choose_goals=given(np.array([*RED, *BLUE])))
+    assert rollout.bob.reward[:, 0].tolist()[:2] == [7.0, 0.0]
+    assert rollout.records.num_bob_steps.tolist() == [2]
+    assert rollout.records.solved.tolist() == [True]
+
+
+def test_the_turn_ends_when_all_are_held():
+    slides(game := make_game(bob_hold_steps=2), "object_2", 1.0)
+    rollout = play(game, choose_goals=given(np.array([*RED, BLUE[0] + 0.08, *BLUE[1:]])))
+    path = rollout.bob.observation[:, 0, game.worlds.observed.bob["object"]]
+    there = distances(path, rollout.records.goal[0]) <= 0.05
+    first = int(np.argmax(there.all(axis=1)))
+    assert rollout.records.num_bob_steps[0] == first + 1  # it is seen a step before it is paid
+
+
+def test_alices_goal_keeps_what_she_did_not_move():
+    slides(game := make_game(), "object", 1.5)
+    states, first = game.worlds.states.copy(), game.worlds.layout["object_2_velocity"].start
+    states[:, first] = 0.5  # a nudge of 1 cm
+    game.worlds.restore(states)
+    rollout = play(game)
+    goal = each_object(rollout.records.goal)[0]
+    assert rollout.records.verdict.tolist() == [Verdict.VALID]
+    assert goal[0, 0] > RED[0] + 0.1
+    np.testing.assert_allclose(goal[1], BLUE)
+
+
+def test_cells_count_where_each_object_was():
+    game = make_game()
+    play(game)
+    half = len(game.cells) // 2
+    assert np.flatnonzero(game.reached).tolist() == game.cells.index(np.array([[*RED, *BLUE]]))[0].tolist()
+    assert game.reached[:half].sum() == game.reached[half:].sum() == 9
+
+
+def test_goals_that_span_two_rounds_lead_from_the_start_of_the_round_before():
+    num = 40
+    game = make_game(num, goal_rounds=2, num_goals=3)
+    slides(game, "object", 1.2)  # 7 cm in the first round
+    first = play(game)
+    assert (first.records.verdict == Verdict.VALID).all()
+    np.testing.assert_allclose(first.records.start_position, np.tile([*RED, *BLUE], (num, 1)))
+    slides(game, "object_2", 1.2)  # and the other in the second
+    second = play(game)
+    from_before = distances(second.records.start_position, first.records.start_position).max(axis=1) == 0.0
+    assert abs(from_before.mean() - SPANNING_SHARE) < 0.25
+    moved = distances(second.records.goal, second.records.start_position) > 0.05
+    assert moved[from_before].all()
+    assert (moved[~from_before] == [False, True]).all()
+    steps = 9 * num  # of Alice's turns, all of which Bob failed
+    failed = ~second.records.solved
+    assert failed[from_before].all()
+    assert len(second.demonstrations.action) == steps // num * int(failed.sum() + from_before.sum())
+    one_round = make_game(num, goal_rounds=1, num_goals=3)
+    slides(one_round, "object", 1.2)
+    ends = play(one_round).records.proposal
+    slides(one_round, "object_2", 1.2)
+    np.testing.assert_allclose(play(one_round).records.start_position, ends, atol=5e-3)
+
+
+def test_a_game_that_ended_is_not_spanned():
+    game = make_game(20, goal_rounds=2)
+    play(game)  # nothing moves: every goal is invalid, and games begin anew
+    starts = game.worlds.object_position.copy()
+    slides(game, "object", 1.2)
+    np.testing.assert_array_equal(play(game).records.start_position, starts)
+
+
+def test_a_game_goes_on_where_its_state_was_taken():
+    def both():
+        return make_game(6, seed=1, places=None, goal_rounds=2, num_goals=5)
+
+    game, later = both(), both()
+    play(game, Noise(), Noise())
+    state = game.state()
+    later.load_state(state)
+    later._rng.bit_generator.state = game._rng.bit_generator.state
+    for _ in range(2):
+        one, other = (play(each, Noise(), Noise(), choose_goals=alices_own) for each in (game, later))
+        assert_same_rollout(one, other)
+
+
+def test_demonstrations_are_exchanged_at_random():
+    rollout = play(make_game(8, places=None, seed=2), Noise(), choose_goals=given(np.array([*RED, *BLUE])))
+    seen = make_game().worlds.observed
+    observation = rollout.bob.observation.reshape(-1, seen.bob.size)
+    given_rows = type(rollout.demonstrations)(observation, rollout.bob.action.reshape(-1, 4))
+    mixed = exchange_at_random(given_rows, exchange(seen, 0, 1), np.random.default_rng(0))
+    chosen = np.random.default_rng(0).random(len(observation)) < 0.5
+    np.testing.assert_array_equal(mixed.observation[~chosen], observation[~chosen])
+    goals = each_object(mixed.observation[chosen][:, seen.bob["goal"]])
+    np.testing.assert_array_equal(goals[:, ::-1], each_object(observation[chosen][:, seen.bob["goal"]]))
+    np.testing.assert_array_equal(mixed.action, given_rows.action)
+
+
+@pytest.fixture(scope="module")
+def config():
+    game = TREE["game"] | {"goal_rounds": 2, "bob_all_reward": 5.0}
+    world = TREE["world"] | {"objects": ["cube", "cube"], "object_size_m": 0.04}
+    world |= {"workspace": {"length_x_m": 0.3, "length_y_m": 0.3}}
+    run = TREE["run"] | {"total_env_steps": 800, "evaluation_interval": 2, "evaluation_episodes": 3}
+    return parse_config(TREE | {"game": game, "world": world, "run": run}, where="a test")
+
+
+def test_a_run_that_is_killed_goes_on_bit_for_bit(config, tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    run(whole, config)
+    run(killed, config, kill_after=3)
+    run(killed, config, resume=True)
+    assert_same_run(whole, killed)

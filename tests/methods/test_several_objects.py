@@ -1,0 +1,130 @@
+"""What is trained with two cubes: samples, hindsight, the live world, what it is asked for, and what refuses it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import service
+from service.base.errors import TandemError
+from service.cli.evaluate import parse_goals
+from service.config import load_config
+from service.config.recipes import recipes
+from service.envs.observations import distances, each_object
+from service.envs.tasks import find_task
+from service.export.exporting import export
+from service.learner import learner as learning
+from service.methods.self_play import LocalSelfPlay
+from service.methods.task import _mixed
+from service.robot.play.game import Game
+from service.robot.running import for_robot
+from tests.runs.runs import TREE, write_yaml
+
+WORLD = TREE["world"] | {"objects": ["cube", "cube"], "object_size_m": 0.04}
+WORLD |= {"workspace": {"length_x_m": 0.3, "length_y_m": 0.3}}
+SHORT = ["run.total_env_steps=400", "run.evaluation_interval=1000", "run.final_episodes=4"]
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    root = tmp_path_factory.mktemp("two")
+    file = write_yaml(root / "two.yaml", TREE | {"world": WORLD, "game": TREE["game"] | {"goal_rounds": 2}})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("service.runs.train.make_artifacts", lambda *arguments: {})  # a video takes long
+        service.train(str(file), SHORT, run_dir=root / "run", registry=root / "registry", publish=True)
+    return root
+
+
+@pytest.fixture
+def two(path):
+    return service.load(str(path / "run"))
+
+
+def test_it_is_published_with_what_it_was_measured_on(path):
+    found = service.load("tiny@1", registry=path / "registry")
+    assert found.manifest.spaces["observation"] == 23
+    assert {"evaluation/one_success_last", "evaluation/mixed_success_last"} <= found.manifest.metrics.keys()
+    assert service.evaluate(found, goals="one", num_episodes=3).num_episodes == 3
+
+
+def test_bobs_samples_and_demonstrations_are_exchanged(path, monkeypatch):
+    config, calls = load_config(path / "two.yaml", SHORT), []
+    for name in ("transform_at_random", "exchange_at_random"):
+        real = getattr(learning, name)
+        monkeypatch.setattr(learning, name, lambda *given, real=real, name=name: calls.append(name) or real(*given))
+    with_two = LocalSelfPlay(config)
+    for _ in range(2):
+        with_two.step()
+    with_two.close()
+    assert calls.count("transform_at_random") >= 2  # reflected and exchanged
+    assert "exchange_at_random" in calls
+    alike = learning.Learner(config)._exchanges()
+    assert len(alike) == 1
+    seen = alike[0].value_observation
+    np.testing.assert_array_equal(np.sort(seen.source), np.arange(44))
+    assert (seen.source != np.arange(44)).sum() == 2 * (5 * 3 + 2)  # five vectors and the contacts of each
+    cylinder = {"shape": "cylinder", "size_m": [0.04, 0.05]}
+    other = config.model_copy(update={"world": config.world.model_validate(WORLD | {"objects": ["cube", cylinder]})})
+    assert learning.Learner(other)._exchanges() == []
+
+
+def test_hindsight_takes_for_each_object_what_was_achieved_or_asked_for():
+    achieved, asked = np.zeros((400, 6), np.float32), np.ones((400, 6), np.float32)
+    taken = each_object(_mixed(achieved, asked, np.random.default_rng(0)))
+    assert (taken[:, :, 0] == taken[:, :, 2]).all()
+    achieved_too = (taken[:, :, 0] == 0.0).sum(axis=1)
+    assert set(achieved_too.tolist()) == {1, 2}
+
+
+def test_a_task_is_learned_with_them(path):
+    small = ["sac.num_worlds=4", "sac.gradient_steps=2", "sac.batch_size=16", "sac.hidden_sizes=[8]"]
+    small += ["sac.learning_starts=200", "run.total_env_steps=300", "run.final_episodes=3"]
+    own = path / "both.py"
+    own.write_text(
+        "from tandem_skills import Task\n"
+        "TASK = Task('Both', success=lambda s: (abs(s.objects.place - s.goal).max(axis=(1, 2)) < 0.05))\n"
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("service.runs.train.make_artifacts", lambda *arguments: {})
+        service.train(
+            str(own), small, method="ours-her", primitives="tiny@1", registry=path / "registry",
+            run_dir=path / "both",
+        )  # fmt: skip
+    assert service.load(str(path / "both"), registry=path / "registry").world.num_objects == 2
+
+
+def test_the_live_world_has_a_goal_for_each(two):
+    game = Game(two, seed=1)
+    try:
+        low, high = np.array(game.world.workspace.lower_m), np.array(game.world.workspace.upper_m)
+        game.set_goal(np.array([9.0, 0.0, -1.0, -0.1, 0.1, 0.1]))
+        np.testing.assert_allclose(game.goal, [high[0], 0.0, game.world.rest_height_m, -0.1, 0.1, 0.1])
+        for mode in game.modes:
+            game.set_mode(mode)
+            for _ in range(12):
+                game.step()
+        assert (each_object(game.goal) >= low).all()
+        assert distances(game.worlds.object_position, game.goal[None]).shape == (1, 2)
+    finally:
+        game.close()
+
+
+def test_goals_are_typed_for_all(two):
+    found = parse_goals("-0.1,0,0.02,0.05,0.1,0.02", two.world)
+    assert found.tolist() == [[-0.1, 0.0, 0.02, 0.05, 0.1, 0.02]]
+    with pytest.raises(TandemError, match="points x,y,z,x,y,z in metres"):
+        parse_goals("-0.1,0,0.02", two.world)
+    with pytest.raises(TandemError, match="outside of the workspace"):
+        parse_goals("-0.1,0,0.02,0.9,0.1,0.02", two.world)
+
+
+def test_who_knows_one_object_says_so(two, tmp_path):
+    with pytest.raises(TandemError, match=r"moves 2 objects; tandem robot knows one"):
+        for_robot(two)
+    with pytest.raises(TandemError, match=r"moves 2 objects; tandem export knows one"):
+        export(two, "numpy", tmp_path / "out")
+    more = replace(find_task("push"), world={"objects": ["cube", "cube"]})
+    with pytest.raises(TandemError, match="was trained in a world of 1 object, and Push has 2"):
+        service.load().playing(more)
+    with pytest.raises(TandemError, match="skill discovery moves one object"):
+        load_config(recipes()["panda-cube-lsd"], ["world.objects=[cube,cube]"])
