@@ -49,7 +49,7 @@ PAGES = {
     "robots.md": ("robots",),
     "results/transfer.md": ("transfer", "transfer_champion"),
     "results/README.md": ("throughput", "mutation"),
-    "../README.md": ("headline",),
+    "../README.md": ("seeds", "headline"),
     "scaling.md": ("box",),
     "hardware.md": ("demo",),
     "own_task.md": ("learned",),
@@ -114,13 +114,14 @@ class Report:
             words = replace_blocks(self._docs / page, dict.fromkeys(names, ""))
             if page in ABOUT_THE_RECIPE:
                 recipe.check_words(self._docs / page, words, studies[RECIPE])
+        seeds = read_all(self._results / "seeds")
         headline = {"headline": [comparison.headline_table(trials)]}
         made = measured_blocks(found) | {
-            "results/pretraining.md": self.pretraining_blocks(runs, found, studies, read_all(self._results / "seeds")),
+            "results/pretraining.md": self.pretraining_blocks(runs, found, studies, seeds),
             "results/skills.md": self.skills_blocks(recorded_skills, controls, runs),
             "results/comparison.md": self.comparison_blocks(trials, longer),
             "downstream.md": headline,
-            "../README.md": headline,
+            "../README.md": headline | {"seeds": [pretraining.seeds_words(seeds[SEEDS])]},
             "own_task.md": {"learned": [measured.own_task_table(read_all(self._results / "own_task"))]},
             "scaling.md": {
                 "box": [scaling.box_block(found.get("scaling_box", found["scaling"]))],

@@ -79,16 +79,31 @@ def seeds_block(study: Mapping[str, Any]) -> str:
     """What ``benchmarks.seeds`` recorded: a row for each seed, and how many there are of what is asked for."""
     at = sorted({row["asked"] for run in study["runs"] for row in run["measured"]})
     head = ("seed", *(f"{millions(asked)}: mixed, table, air, *Larger*" for asked in at), "dips")
-    rows, counts = [], []
+    rows = []
     for run in study["runs"]:
         found = {row["asked"]: row for row in run["measured"]}
         cells = [", ".join(f"{100 * found[a][kind]['last']:.1f}" for kind in KINDS) if a in found else "" for a in at]
         rows.append((str(run["seed"]), *cells, str(num_dips(run["curve"]))))
-    for asked in at:
+    words = f"At least {percent(ASKED_RATES['mixed'])} of mixed goals: {_how_many(study)} env steps."
+    return f"{table(head, rows)}\n\n{words}"
+
+
+def _how_many(study: Mapping[str, Any]) -> str:
+    """How many runs solve what is asked of mixed goals, at each number of env steps."""
+    counts = []
+    for asked in sorted({row["asked"] for run in study["runs"] for row in run["measured"]}):
         rates = [row["mixed"]["last"] for run in study["runs"] for row in run["measured"] if row["asked"] == asked]
         counts.append(f"{sum(rate >= ASKED_RATES['mixed'] for rate in rates)} of {len(rates)} at {millions(asked)}")
-    words = f"At least {percent(ASKED_RATES['mixed'])} of mixed goals: {', '.join(counts)} env steps."
-    return f"{table(head, rows)}\n\n{words}"
+    return ", ".join(counts)
+
+
+def seeds_words(study: Mapping[str, Any]) -> str:
+    """The same in a sentence for the README."""
+    asked = percent(ASKED_RATES["mixed"])
+    return (
+        f"Of runs with seeds on which nothing was tuned, so many solve {asked} of random goals or more:\n"
+        f"{_how_many(study)} env steps ([each seed](docs/results/pretraining.md#every-seed))."
+    )
 
 
 def other_seeds(name: str, study: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from benchmarks import seeds
-from benchmarks.report.pretraining import num_dips, other_seeds, seeds_block, why_alice_table
+from benchmarks.report.pretraining import num_dips, other_seeds, seeds_block, seeds_words, why_alice_table
 from benchmarks.why_alice import ARMS
 from service.runs import train
 from tests.runs.runs import TREE, write_yaml
@@ -73,6 +73,7 @@ def test_the_table_of_seeds_by_hand():
         "",
         "At least 95 % of mixed goals: 1 of 2 at 2 M, 1 of 1 at 5 M env steps.",
     ]
+    assert "95 % of random goals or more:\n1 of 2 at 2 M, 1 of 1 at 5 M env steps (" in seeds_words({"runs": runs})
     for run, day in zip(runs, (27, 28), strict=True):
         run |= {"git_commit": "fb14796" + 33 * "0", "machine": {"time": f"2026-11-{day}T08:00:00"}}
     first, _, head, *_ = other_seeds("panda-cube-paper", {"runs": runs}).splitlines()
