@@ -41,8 +41,8 @@ _TITLES: dict[Mode, str] = {
 _LEAST_WEIGHT = 0.01
 """Of a slider; the range of Bob's gate is the same."""
 SPEEDS = {"1/8": 0.125, "1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0, "4": 4.0}
-_HELP = """**Drag the arrows at the green shape** to put the goal elsewhere: Bob goes there. Turn the view with the left
-mouse button, move it with the right one."""
+_HELP = """**Drag the arrows at a transparent shape** to put that goal elsewhere: Bob goes there. Turn the view with the
+left mouse button, move it with the right one."""
 
 
 class LiveScene:
