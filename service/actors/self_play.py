@@ -153,7 +153,8 @@ class SelfPlay:
         verdict = classify_goal(start_position, end_position, self.config.world.workspace, game.success_distance_m)
         verdict[diverged] = Verdict.FALLEN
         spanning = self._spanning(end_position, verdict == Verdict.VALID)
-        this_round = _RoundBefore(alice, start_state.copy(), start_position.copy())
+        keeps = game.goal_rounds > 1
+        this_round = _RoundBefore(alice, start_state.copy(), start_position.copy()) if keeps else None
         if self._before is not None:
             start_state[spanning] = self._before.start_state[spanning]
             start_position[spanning] = self._before.start_position[spanning]
@@ -204,7 +205,7 @@ class SelfPlay:
         )
         worlds.diverged = []
         self._sequence += 1
-        self._before = this_round if game.goal_rounds > 1 else None
+        self._before = this_round
         return rollout
 
     def _spanning(self, end_position: StateArray, valid: BoolArray) -> BoolArray:

@@ -186,8 +186,6 @@ class WorldConfig(FrozenModel):
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
-        if self.objects and len(self.objects) == 1:
-            raise ValueError("object and objects: a world has the one or the other")
         if self.fixtures and self.fixture != "none":
             raise ValueError(f"fixture = {self.fixture!r} and fixtures: a world has the one or the other")
         if self.objects and self.object != "cube":

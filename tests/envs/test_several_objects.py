@@ -177,7 +177,7 @@ def test_success_and_what_a_task_sees(worlds):
     ("world", "said"),
     [
         ({"object": "sphere", "objects": ["cube", "cube"]}, "object = 'sphere' and objects"),
-        ({"object": "sphere", "objects": ["cube"]}, "object and objects: a world has the one or the other"),
+        ({"object": "sphere", "objects": ["cube"]}, "object = 'sphere' and objects: a world has the one or the other"),
         ({"objects": ["cube", "cube"], "fixture": "wall"}, "fixture = 'wall' and 2 objects: it is for one"),
         ({"objects": ["cube", "pyramid"]}, "cube"),
         ({"objects": ["cube"] * 5}, "at most 4"),
