@@ -3,13 +3,16 @@
     python -m benchmarks.scaling runs/cube --json docs/results/scaling_box.json
 
 Env steps a second of a trained run with 1, 2, ... rollout actors, and with one that has a thread for every core, and
-the CPU time of every process. What ``docs/scaling.md`` says beyond one box was computed from ``scaling.json``.
+the CPU time of every process. From the CPU times of one and of two actors, and the updates that seeds needed until they
+had a skill, ``docs/scaling.md`` says how long more cores take.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
+import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +23,9 @@ from benchmarks.report.markdown import commit, percent, table
 from benchmarks.training_process import ENDLESS, PLAIN, Measured, measure_copy, overrides, scratch
 from service.config.self_play import SelfPlayConfig
 from service.store.run_directory import RunDirectory
+
+CORES = (2, 3, 4, 8, 16, 64)
+"""Numbers of cores of which the model tells: one for the learner, the others for an actor each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +101,70 @@ def box_block(result: Mapping[str, Any]) -> str:
     where = result["machine"]
     words = f"{where['cpu']}, {where['num_cpus']} cores, {commit(where['git_commit'])}, {where['time'][:10]}."
     return f"{words}\n\n{table(head, rows)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Costs:
+    """CPU seconds of an update's parts."""
+
+    learner_s: float
+    round_s: float
+    """Of an actor's round, whatever the number of its worlds."""
+    world_s: float
+    """Of each world of it."""
+    num_worlds: int
+    """Of all actors together."""
+
+    @classmethod
+    def of(cls, one_box: Mapping[str, Any]) -> Costs:
+        """From what was measured with one actor, and with two that have half of the worlds each."""
+        one, two = one_box["1"], one_box["2"]
+        alone_s, both_s = (each["cores"]["actor"] * each["iteration_s"] for each in (one, two))
+        round_s = max(both_s - alone_s, 0.0)  # two actors pay it twice
+        num_worlds = one["num_worlds"]
+        learner_s = one["cores"]["learner"] * one["iteration_s"]
+        return cls(learner_s, round_s, (alone_s - round_s) / num_worlds, num_worlds)
+
+    def update_s(self, num_actors: int) -> float:
+        """Seconds between updates: of the slower of the learner and of actors that share the worlds, a core each."""
+        worlds = math.ceil(self.num_worlds / num_actors)
+        return max(self.learner_s, self.round_s + worlds * self.world_s)
+
+    @property
+    def num_fed(self) -> float:
+        """Actors with all the worlds each whose rollouts the learner takes in while they play the next ones."""
+        return (self.round_s + self.num_worlds * self.world_s) / self.learner_s
+
+    @property
+    def num_useful(self) -> int | None:
+        """Least number of actors with which the learner is what takes longest; None: even one world each is slower."""
+        fitting = [num for num in range(1, self.num_worlds + 1) if self.update_s(num) <= self.learner_s]
+        return fitting[0] if fitting else None
+
+
+def model_block(result: Mapping[str, Any], skill: Mapping[str, Any]) -> str:
+    """Minutes to a skill on more cores, in Markdown, for ``docs/scaling.md``.
+
+    Args:
+        result: one box, as ``scaling_box.json`` has it.
+        skill: times to a skill, as ``benchmarks.time_to_skill`` writes them.
+    """
+    costs = Costs.of(result["one_box"])
+    num_updates = statistics.median(run["at"]["iteration"] if run["reached"] else math.inf for run in skill["runs"])
+    rows = []
+    for cores in CORES:
+        update_s = costs.update_s(cores - 1)
+        minutes = num_updates * update_s / 60.0
+        busy = costs.learner_s / update_s
+        seeds = cores // 2 * 60.0 / (num_updates * costs.update_s(1) / 60.0)
+        rows.append((str(cores), f"{update_s:.2f} s", f"{minutes:.1f}", percent(busy), f"{seeds:.0f}"))
+    head = ("cores", "an update every", "minutes to the skill", "learner busy", "or seeds an hour, two cores each")
+    useful = costs.num_useful
+    stops = "It gains from every further actor." if useful is None else f"It gains nothing beyond {useful + 1} cores."
+    return (
+        f"One learner of one thread keeps up with {costs.num_fed:.1f} actors of {costs.num_worlds} worlds each. "
+        f"A run shares {costs.num_worlds} worlds out among its actors. {stops}\n\n{table(head, rows)}"
+    )
 
 
 if __name__ == "__main__":

@@ -19,15 +19,14 @@ from benchmarks import scaling, time_to_skill, transfer
 from benchmarks.measuring import one_line_errors
 from benchmarks.report import comparison, figures, measured, pretraining, recipe, skills
 from benchmarks.report.downstream import draw_table, write_results
-from benchmarks.report.recipe import RECIPE
 from benchmarks.report.results import Result, read_all
 from benchmarks.reproduce import RESULTS, experiments
 from benchmarks.run_files import Run
 from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
 
-FILES = ("env_throughput", "throughput", "world_speed", "deployed", "mutation", "scaling", "scaling_box", "robots",
-         "transfer", "transfer_champion", "demo")  # fmt: skip
+FILES = ("env_throughput", "throughput", "world_speed", "deployed", "mutation", "scaling_box", "robots",
+         "time_to_skill", "transfer", "transfer_champion", "demo")  # fmt: skip
 """Names of the recorded files of which there is one each."""
 PAGES = {
     "results/pretraining.md": (
@@ -50,7 +49,7 @@ PAGES = {
     "results/transfer.md": ("transfer", "transfer_champion"),
     "results/README.md": ("throughput", "mutation"),
     "../README.md": ("seeds", "headline"),
-    "scaling.md": ("box",),
+    "scaling.md": ("box", "model"),
     "hardware.md": ("demo",),
     "own_task.md": ("learned",),
 }
@@ -105,7 +104,6 @@ class Report:
         """Write all pages and pictures."""
         found = read_all(self._results, FILES)
         runs = [run for run in read_all(self._results / "runs").values() if "ablation" not in run]
-        studies = read_all(self._results / "time_to_skill")
         trials, longer, recorded_skills, controls = (
             list(read_all(self._results / name).values())
             for name in ("downstream", "downstream_longer", "skills", "controls")
@@ -113,18 +111,20 @@ class Report:
         for page, names in PAGES.items():  # what is wrong with a page is found before anything is drawn
             words = replace_blocks(self._docs / page, dict.fromkeys(names, ""))
             if page in ABOUT_THE_RECIPE:
-                recipe.check_words(self._docs / page, words, studies[RECIPE])
+                recipe.check_words(self._docs / page, words, found["time_to_skill"])
         seeds = read_all(self._results / "seeds")
         headline = {"headline": [comparison.headline_table(trials)]}
+        judged = f"{pretraining.seeds_words(seeds[SEEDS])}\n{time_to_skill.words(found['time_to_skill'])}"
         made = measured_blocks(found) | {
-            "results/pretraining.md": self.pretraining_blocks(runs, found, studies, seeds),
+            "results/pretraining.md": self.pretraining_blocks(runs, found, seeds),
             "results/skills.md": self.skills_blocks(recorded_skills, controls, runs),
             "results/comparison.md": self.comparison_blocks(trials, longer),
             "downstream.md": headline,
-            "../README.md": headline | {"seeds": [pretraining.seeds_words(seeds[SEEDS])]},
+            "../README.md": headline | {"seeds": [judged]},
             "own_task.md": {"learned": [measured.own_task_table(read_all(self._results / "own_task"))]},
             "scaling.md": {
-                "box": [scaling.box_block(found.get("scaling_box", found["scaling"]))],
+                "box": [scaling.box_block(found["scaling_box"])],
+                "model": [scaling.model_block(found["scaling_box"], found["time_to_skill"])],
             },
         }
         for page, blocks in made.items():
@@ -134,7 +134,7 @@ class Report:
             self.files.append(path)
         self.files += write_results(self._results, trials)
 
-    def pretraining_blocks(self, runs: Sequence[Run], found: Results, studies: Results, seeds: Results) -> Blocks:
+    def pretraining_blocks(self, runs: Sequence[Run], found: Results, seeds: Results) -> Blocks:
         """Parts of the blocks about pre-training."""
         show = self.show
         counted = [run for run in runs if "curriculum" in run]  # older files have only a sample of the goals
@@ -153,7 +153,7 @@ class Report:
             for run in covered
         ]
         return {
-            "skill": [recipe.recipe_words(studies[RECIPE]), time_to_skill.report(studies[RECIPE])],
+            "skill": [text(found["time_to_skill"]) for text in (recipe.recipe_words, time_to_skill.report)],
             "seeds": [text(seeds[SEEDS]) for text in (recipe.recipe_words, pretraining.seeds_block) if SEEDS in seeds],
             "others": [pretraining.other_seeds(name, study) for name, study in seeds.items() if name != SEEDS],
             "why": [pretraining.why_alice_table(read_all(self._results / "why_alice"))],

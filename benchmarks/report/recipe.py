@@ -12,8 +12,6 @@ from service.base.errors import TandemError
 from service.config import load_config
 from service.config.self_play import SelfPlayConfig
 
-RECIPE = "recipe"
-"""Name of the recorded time to a skill with the recipe, without any change."""
 SHIPPED = "the shipped recipe"
 _OF_ONE_RUN = ("name", "seed", "run.")
 """Keys that may differ between two runs of the same recipe."""

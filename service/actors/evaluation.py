@@ -95,6 +95,7 @@ def evaluate(
     with WorldBatch(config, num_episodes, num_threads=num_threads) as worlds:
         worlds.reset(rng)
         rules = Rules(task, worlds, success_distance_m)
+        rules.place(rng)
         if goal is None:
             goal = rules.draw(rng)
         ever = last = np.zeros(num_episodes, dtype=bool)

@@ -159,7 +159,7 @@ class WorldBatch:
         a box is anywhere.
         """
         states = np.tile(self._fresh_state, (num, 1))
-        places = draw_starts(rng, num, self.bank.largest, self._gripper_at_start)
+        places = draw_starts(rng, num, self.bank.largest, self.gripper_at_start)
         smaller_m = np.subtract(self.config.rest_heights_m, self.bank.largest.rest_heights_m)
         places_at(states, self._objects)[:] = each_object(places.object)
         places_at(states, self._objects)[:, :, 2] += smaller_m
@@ -197,6 +197,11 @@ class WorldBatch:
     def restore(self, states: StateArray, worlds: BoolArray | None = None) -> None:
         """Overwrite the states of all worlds, or of those where ``worlds`` is true, with (N or count, S) rows."""
         self.states[slice(None) if worlds is None else worlds] = states
+        self._see()
+
+    def put_objects(self, place: StateArray, worlds: slice) -> None:
+        """Put the objects of some worlds at (count, 3 K) centres, metres; they stay turned as they are."""
+        places_at(self.states[worlds], self._objects)[:] = each_object(place)
         self._see()
 
     # --- stepping --------------------------------------------------------------------------------------------------
@@ -366,7 +371,7 @@ class WorldBatch:
         state[self.layout["fingers"]] = self.robot.finger_values(np.array([self._widest_m]))[0]
         self._check_start(state)
         # Where there is no room, it is said now.
-        places = draw_starts(np.random.default_rng(0), _NUM_TRIED_STARTS, self.bank.largest, self._gripper_at_start)
+        places = draw_starts(np.random.default_rng(0), _NUM_TRIED_STARTS, self.bank.largest, self.gripper_at_start)
         if self.config.obstacles or self.config.objects:  # before the first reset, too, nothing is inside another
             state[self.layout["box_place"]] = places.box[0]
             places_at(state[None], self._objects)[:] = each_object(places.object[:1])
@@ -381,7 +386,7 @@ class WorldBatch:
         mujoco.mj_forward(self.model, data)
         # On the highest table, things come as much nearer to the gripper.
         gripper, higher_m = gripper_boxes(self.model, data), float(self.bank.table_height_m.max())
-        self._gripper_at_start = gripper._replace(lower=gripper.lower - np.array([0.0, 0.0, higher_m]))
+        self.gripper_at_start = gripper._replace(lower=gripper.lower - np.array([0.0, 0.0, higher_m]))
         for contact in data.contact[: data.ncon]:
             names = [self.model.geom(int(geom)).name for geom in contact.geom]
             fixed = [name for name in names if name.startswith(FIXTURE_PREFIX)]

@@ -12,7 +12,14 @@ from service.base.user_code import CodeError, checked, naming_errors_of, place_o
 from service.config.run import SUCCESS_DISTANCE_M
 from service.envs.batch import WorldBatch
 from service.envs.observations import distances, each_object
-from service.envs.sampling import GoalKind, check_goals, draw_goals, inside_fixtures, inside_obstacles
+from service.envs.sampling import (
+    GoalKind,
+    check_goals,
+    draw_goals,
+    inside_each_other,
+    inside_fixtures,
+    inside_obstacles,
+)
 from service.envs.task import Bodies, Task, View
 
 _MAX_DRAWS = 1000
@@ -73,21 +80,38 @@ class Rules:
         Raises:
             CodeError: the function gives something else, or no goal that is within reach and clear.
         """
-        config, goals = self._worlds.config, self.task.goals
-        places = self._worlds.places.of(worlds)
-        if isinstance(goals, str):
-            return draw_goals(goals, rng, config, self._near_m, places)
-        view = self.view(self._worlds.object_position).of(worlds)
-        goal, wrong = np.empty_like(places.object), np.ones(len(places.object), dtype=bool)
+        if isinstance(self.task.goals, str):
+            places = self._worlds.places.of(worlds)
+            return draw_goals(self.task.goals, rng, self._worlds.config, self._near_m, places)
+        return self._places("goals", rng, worlds)
+
+    def place(self, rng: np.random.Generator, worlds: slice = _ALL) -> None:
+        """Put objects where the task has them start, in worlds that are at a random start; it may say nothing.
+
+        Raises:
+            CodeError: the function gives something else, or no places that are within reach and clear.
+        """
+        if self.task.starts is not None:
+            self._worlds.put_objects(self._places("starts", rng, worlds), worlds)
+
+    def _places(self, name: str, rng: np.random.Generator, worlds: slice) -> StateArray:
+        """(N, 3 K) places by a function of the task; drawn again where they are out of reach, or inside something."""
+        batch = self._worlds
+        config, obstacles = batch.config, batch.places.of(worlds).obstacles
+        view = self.view(batch.object_position).of(worlds)
+        place, wrong = view.goal.reshape(len(view.goal), -1).copy(), np.ones(len(view.goal), dtype=bool)
         for _ in range(_MAX_DRAWS):
             asked = view.of(wrong)
-            found = self._asked("goals", asked.objects.place.shape, asked, rng)
-            goal[wrong] = found.reshape(len(found), -1)
-            wrong = self.out_of_reach(goal) | inside_fixtures(goal, config)
-            wrong |= inside_obstacles(goal, places.obstacles, config)
+            found = self._asked(name, asked.objects.place.shape, asked, rng)
+            place[wrong] = found.reshape(len(found), -1)
+            wrong = self.out_of_reach(place) | inside_fixtures(place, config)
+            wrong |= inside_obstacles(place, obstacles, config)
+            if name == "starts":
+                wrong |= inside_each_other(place, config, batch.gripper_at_start)
             if not wrong.any():
-                return goal
-        raise CodeError(f"{place_of(goals)[1]}: goals gave no place that is within reach and clear: choose others")
+                return place
+        where = place_of(getattr(self.task, name))[1]
+        raise CodeError(f"{where}: {name} gave no place that is within reach and clear: choose others")
 
     def advance(self, goal: StateArray) -> None:
         """Count a step that was made, and update the memory."""

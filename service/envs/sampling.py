@@ -372,11 +372,23 @@ def inside_fixtures(position: StateArray, config: WorldConfig) -> BoolArray:
     A box, which is elsewhere in every game, is none of them.
     """
     fixtures = _around_fixtures(config)
-    return _some_object(
-        position,
-        config,
-        lambda around: _overlap(Boxes(around.lower + _TOUCHES_M, around.upper - _TOUCHES_M), fixtures),
-    )
+    return _some_object(position, config, lambda around: _overlap(_smaller(around), fixtures))
+
+
+def inside_each_other(position: StateArray, config: WorldConfig, gripper: Boxes) -> BoolArray:
+    """(N,) whether objects at their places of (N, 3 K) would be more than a millimetre inside each other or it."""
+    place = each_object(position)
+    around = [_smaller(_around(place[:, index], body)) for index, body in enumerate(config.bodies)]
+    inside: BoolArray = np.any([_overlap(each, gripper) for each in around], axis=0)
+    for index, each in enumerate(around[1:], start=1):
+        others = Boxes(*(np.stack(corners, axis=1) for corners in zip(*around[:index], strict=True)))
+        inside |= _overlap(each, others)
+    return inside
+
+
+def _smaller(around: Boxes) -> Boxes:
+    """Boxes that do not reach into what they only touch, however places were rounded."""
+    return Boxes(around.lower + _TOUCHES_M, around.upper - _TOUCHES_M)
 
 
 def _some_object(position: StateArray, config: WorldConfig, test: Callable[[Boxes], BoolArray]) -> BoolArray:

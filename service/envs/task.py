@@ -1,7 +1,7 @@
 """A task: what it changes in the world, where its goals are, what counts as success, and what is paid.
 
-A task is data, and up to four functions over a ``View`` of N worlds: ``goals``, ``success``, ``reward`` and
-``remember``. ``service.envs.rules`` applies one to worlds that are played.
+A task is data, and up to five functions over a ``View`` of N worlds: ``starts``, ``goals``, ``success``, ``reward``
+and ``remember``. ``service.envs.rules`` applies one to worlds that are played.
 """
 
 from __future__ import annotations
@@ -113,6 +113,9 @@ class Task:
     the view at the start and of random numbers to (N, K, 3), metres."""
     world: Mapping[str, Any] = field(default_factory=dict)
     """Settings of a world that are replaced."""
+    starts: Callable[[View, np.random.Generator], Any] | None = None
+    """(N, K, 3) places of the objects' centres at the start, metres, of the view at a random one and of random numbers;
+    None: random, on the table and clear of each other."""
     success: Function | None = None
     """(N,) bool; None: each object is within 5 cm of its goal. What counts is the last step of an episode."""
     reward: Function | None = None

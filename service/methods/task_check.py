@@ -41,6 +41,7 @@ def check_task(task: Task, world: WorldConfig, *, relabels: bool = False) -> Non
     with WorldBatch(world, _NUM_WORLDS, num_threads=1) as worlds:
         rules = Rules(task, worlds)
         worlds.reset(rng)
+        rules.place(rng)
         goal = rules.draw(rng)
         start = worlds.states.copy()
 

@@ -135,9 +135,9 @@ class Trained:
             TandemError: its task says otherwise.
         """
         task = self.tried_on
-        if task.closed or task.is_own or not isinstance(task.goals, str):
+        if task.closed or task.is_own or task.starts or not isinstance(task.goals, str):
             raise TandemError(
-                f"{self.title}: that task has goals, success or reward of its own, which are not known here"
+                f"{self.title}: that task has starts, goals, success or reward of its own, which are not known here"
             )
         return task.goals
 

@@ -174,3 +174,26 @@ def test_a_box_by_hand():
     assert found["learner_idle_share"] == pytest.approx(0.6)  # 4 s of updates in 10 s
     assert found["actor_idle_share"] == pytest.approx(0.2)  # 16 s of rounds in 20 s of two actors
     assert found["cores"] == {"actor": 2.0, "learner": 0.5}
+
+
+def test_more_cores_by_hand():
+    def measured(learner):
+        one = {"iteration_s": 1.0, "num_worlds": 100, "cores": {"actor": 0.9, "learner": learner}}
+        two = {"iteration_s": 0.5, "num_worlds": 50, "cores": {"actor": 2.2, "learner": 0.6}}  # 1.1 s for both rounds
+        return {"one_box": {"1": one, "2": two}}
+
+    costs = scaling.Costs.of(measured(0.3)["one_box"])
+    assert (costs.round_s, costs.world_s) == (pytest.approx(0.2), pytest.approx(0.007))
+    assert costs.num_fed == pytest.approx(3.0)
+    assert costs.update_s(1) == pytest.approx(0.9)
+    assert costs.update_s(7) == pytest.approx(0.305)  # 15 worlds each
+    assert (costs.update_s(8), costs.num_useful) == (0.3, 8)  # 13 worlds take .291 s
+    assert scaling.Costs.of(measured(0.1)["one_box"]).num_useful is None  # a round takes .2 s without any world
+    skill = {"runs": [{"reached": True, "at": {"iteration": num}} for num in (100, 200, 900)]}
+    block = scaling.model_block(measured(0.3), skill)
+    assert "keeps up with 3.0 actors of 100 worlds each" in block
+    assert "It gains nothing beyond 9 cores." in block
+    # 200 updates of .9 s are 3 minutes, of .3 s one; eight runs of 3 minutes are 160 an hour
+    assert ["16", "0.30 s", "1.0", "100 %", "160"] in [line.strip("| ").split(" | ") for line in block.splitlines()]
+    never = {"runs": [{"reached": False}]}
+    assert "| inf |" in scaling.model_block(measured(0.3), never)

@@ -73,7 +73,7 @@ def test_blocks_are_replaced_between_their_markers(tmp_path):
 
 # --- words by hand ----------------------------------------------------------------------------------------------------
 
-STUDY = json.loads((DOCS / "results" / "time_to_skill" / "recipe.json").read_text())
+STUDY = json.loads((DOCS / "results" / "time_to_skill.json").read_text())
 SHIPS = load_config(RECIPE_FILE).model_dump(mode="json")
 
 
@@ -85,7 +85,7 @@ def test_a_page_that_says_the_shipped_recipe_is_not_made_where_another_one_was_r
     docs, page = tmp_path / "docs", ABOUT_THE_RECIPE[-1]
     shutil.copytree(DOCS, docs, ignore=shutil.ignore_patterns("*.png", "primitives"))
     shutil.copy(DOCS.parent / "README.md", tmp_path)
-    recorded = docs / "results" / "time_to_skill" / "recipe.json"
+    recorded = docs / "results" / "time_to_skill.json"
     recipe = SHIPS | {"policy": SHIPS["policy"] | {"bob": SHIPS["policy"]["bob"] | {"num_primitives": 5}}}
     recorded.write_text(json.dumps(study_of(recipe)))
     (docs / page).write_text((docs / page).read_text() + "\nIt is The\nshipped recipe.\n")

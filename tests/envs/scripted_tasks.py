@@ -15,7 +15,7 @@ from service.config import WorldConfig
 from service.config.run import SUCCESS_DISTANCE_M
 from service.envs import scene
 from service.envs.batch import DISPLACEMENT_M, WorldBatch
-from service.envs.observations import ACTION
+from service.envs.observations import ACTION, each_object
 from service.envs.sampling import draw_goals
 from service.envs.task import EPISODE_STEPS
 from service.envs.tasks import find_task
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 OPEN, CLOSE = 1.0, -1.0
-_GRASP_HEIGHT_M, _PUSH_HEIGHT_M = 0.022, 0.02
+_GRASP_BELOW_M, _PUSH_HEIGHT_M = 0.003, 0.02
 _ABOVE_M = 0.025
 """Least space between what is carried and what it is carried over."""
 _NEAR_M = 0.012
@@ -46,15 +46,27 @@ class Scripted:
     worlds: WorldBatch
     goal: Array
     """(N, 3) metres."""
+    index: int = 0
+    """Of the object, where there are several."""
+    over_m: float = 0.0
+    """Height of what it is carried over, where that is no fixture; then it is let go of at the goal, too."""
 
     def __post_init__(self) -> None:
         self.phase = np.zeros(self.worlds.num_worlds, dtype=np.int64)
         self.waited = np.zeros(self.worlds.num_worlds, dtype=np.int64)
         self.travel_m = self.worlds.config.start_height_m
 
+    @property
+    def object_position(self) -> Array:
+        """(N, 3) of the object that it handles, metres."""
+        return each_object(self.worlds.object_position)[:, self.index]
+
     def act(self) -> NDArray[np.float32]:
         """(N, 4) the next actions."""
-        target, grip = self._push() if self.worlds.config.gripper == "blocked" else self._pick()
+        return self.towards(*(self._push() if self.worlds.config.gripper == "blocked" else self._pick()))
+
+    def towards(self, target: Array, grip: Array) -> NDArray[np.float32]:
+        """(N, 4) actions that bring the grippers to (N, 3), metres, with (N,) finger commands."""
         actions = np.empty((self.worlds.num_worlds, 4), dtype=np.float32)
         actions[:, :3] = np.clip((target - self.worlds.ee_position) / DISPLACEMENT_M, -1.0, 1.0)
         actions[:, 3] = grip
@@ -62,38 +74,38 @@ class Scripted:
 
     def _pick(self) -> tuple[Array, Array]:
         """Above the object, down, close, up where something is in the way, across, down, and open over a box."""
-        ee, obj = self.worlds.ee_position, self.worlds.object_position
+        ee, obj = self.worlds.ee_position, self.object_position
         hold = ee - obj
         self.phase[(self.phase > 2) & (self.phase < 6) & (np.linalg.norm(hold, axis=1) > _DROPPED_M)] = 0
         self.waited[self.phase < 2] = 0
         carry_m = self._carry_height()
         over = np.linalg.norm((obj - self.goal)[:, :2], axis=1) < _NEAR_M
         above_object = self.worlds.reach.clip(_at_height(obj, self.travel_m))
-        at_object = _at_height(obj, _GRASP_HEIGHT_M)
+        at_object = obj - [0.0, 0.0, _GRASP_BELOW_M]
         up, across = _at_height(obj, carry_m) + hold, _at_height(self.goal, carry_m) + hold
-        # a box is entered no deeper than the fingers need to stay above its rim
-        place = np.maximum(self.goal, [-np.inf, -np.inf, self._release_height()]) + hold
+        release_m = self._release_height()
+        place = np.maximum(self.goal, _at_height(self.goal, release_m)) + hold
         targets = np.stack([above_object, at_object, at_object, up, across, place, ee])
         grips = np.array([OPEN, OPEN, CLOSE, CLOSE, CLOSE, CLOSE, OPEN])
         self.waited[self.phase == 2] += 1
         done = np.stack(
             [
                 np.linalg.norm((ee - above_object)[:, :2], axis=1) < _NEAR_M,
-                ee[:, 2] < _GRASP_HEIGHT_M + 0.006,
+                ee[:, 2] < at_object[:, 2] + 0.006,
                 self.waited >= _CLOSE_STEPS,
                 obj[:, 2] > carry_m - 0.01,
                 over,
-                np.full(len(obj), self.worlds.config.fixture == "box") & (obj[:, 2] < self._release_height() + 0.01),
+                (obj[:, 2] < release_m + (0.002 if self.over_m else 0.01)),
                 np.zeros(len(obj), dtype=bool),
             ]
         )
-        if self.worlds.config.fixture == "none":
+        if self.worlds.config.fixture == "none" and not self.over_m:
             done[3] = done[4] = True
         return self._advance(targets, grips, done)
 
     def _push(self) -> tuple[Array, Array]:
         """Above a place behind the object, down, then towards the goal; where the object slips aside, round again."""
-        ee, obj = self.worlds.ee_position, self.worlds.object_position
+        ee, obj = self.worlds.ee_position, self.object_position
         way = (self.goal - obj) * [1.0, 1.0, 0.0]
         distance = np.linalg.norm(way, axis=1)
         way /= np.maximum(distance, 1e-9)[:, None]
@@ -126,15 +138,18 @@ class Scripted:
     def _carry_height(self) -> float:
         """Height of the object's centre on its way."""
         highest = {"none": 0.0, "wall": scene.WALL_HEIGHT_M, "box": scene.BOX_HEIGHT_M}
-        return highest[self.worlds.config.fixture] + self.worlds.config.object_size_m / 2 + _ABOVE_M
+        return max(highest[self.worlds.config.fixture], self.over_m) + self.worlds.config.object_size_m / 2 + _ABOVE_M
 
-    def _release_height(self) -> float:
-        """Height of the object's centre; the fingertips are 1 cm below it when they hold it at its middle."""
+    def _release_height(self) -> Array | float:
+        """Height of the object's centre at which it is let go of; the fingertips are 1 cm below its middle at most."""
+        if self.over_m:
+            return self.goal[:, 2]
+        # a box is entered no deeper than the fingers need to stay above its rim
         return scene.BOX_HEIGHT_M + 0.015 if self.worlds.config.fixture == "box" else -np.inf
 
 
-def _at_height(position: Array, height_m: float) -> Array:
-    return np.column_stack([position[:, :2], np.full(len(position), height_m)])
+def _at_height(position: Array, height_m: Array | float) -> Array:
+    return np.column_stack([position[:, :2], np.broadcast_to(height_m, len(position))])
 
 
 def play_task(

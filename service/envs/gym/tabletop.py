@@ -130,6 +130,7 @@ class GoalWorlds:
         self.rules.begin(worlds)
         for world in index:
             here = slice(world, world + 1)
+            self.rules.place(self._random[world], here)
             self._goal[here] = self.rules.draw(self._random[world], here)
         if goal is not None:
             self._goal[:] = goal

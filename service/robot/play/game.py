@@ -121,6 +121,7 @@ class Game:
     def reset(self) -> None:
         """Begin anew: the arm at home, the object elsewhere, and the goal, too, unless it was put where it is."""
         self.worlds.reset(self._rng)
+        self._rules.place(self._rng)
         self._begin_turn("alice" if self.mode == "alice" else "bob")
         self._round = 0
         if self.new_goals:
