@@ -159,12 +159,23 @@ def model_block(result: Mapping[str, Any], skill: Mapping[str, Any]) -> str:
         seeds = cores // 2 * 60.0 / (num_updates * costs.update_s(1) / 60.0)
         rows.append((str(cores), f"{update_s:.2f} s", f"{minutes:.1f}", percent(busy), f"{seeds:.0f}"))
     head = ("cores", "an update every", "minutes to the skill", "learner busy", "or seeds an hour, two cores each")
-    useful = costs.num_useful
-    stops = "It gains from every further actor." if useful is None else f"It gains nothing beyond {useful + 1} cores."
     return (
         f"One learner of one thread keeps up with {costs.num_fed:.1f} actors of {costs.num_worlds} worlds each. "
-        f"A run shares {costs.num_worlds} worlds out among its actors. {stops}\n\n{table(head, rows)}"
+        f"A run shares {costs.num_worlds} worlds out among its actors. It gains {_until(costs)}.\n\n{table(head, rows)}"
     )
+
+
+def words(result: Mapping[str, Any]) -> str:
+    """The same in a sentence, for the README."""
+    return (
+        f"By a model of measured costs a run gains {_until(Costs.of(result['one_box']))}; "
+        "more are for more seeds ([scaling](docs/scaling.md))."
+    )
+
+
+def _until(costs: Costs) -> str:
+    useful = costs.num_useful
+    return "from every further core" if useful is None else f"nothing beyond {useful + 1} cores"
 
 
 if __name__ == "__main__":

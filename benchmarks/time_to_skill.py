@@ -65,14 +65,15 @@ def run_seed(config: Path, settings: Sequence[str], seed: int, max_env_steps: in
 
 def report(result: Mapping[str, Any]) -> str:
     """A row for each seed, as Markdown, and the median of their times."""
-    lines = ["| seed | minutes | env steps | updates | CPU minutes |", "| --- | --- | --- | --- | --- |"]
+    lines = ["| seed | minutes | known after | env steps | updates | CPU minutes |", "|" + " --- |" * 6]
     for run in result["runs"]:
         if (at := run["at"]) is None:
             last = run["curve"][-1] if run["curve"] else {"env_steps": 0}
-            cells = f"not within {last['env_steps'] / 1e6:.1f} M env steps | | | "
+            cells = f"not within {last['env_steps'] / 1e6:.1f} M env steps | | | | "
         else:
+            known = run["curve"][run["curve"].index(at) + NUM_IN_A_ROW - 1]
             steps = f"{at['env_steps'] / 1e6:.2f} M | {at['iteration']:.0f}"
-            cells = f"{at['wall_s'] / 60:.1f} | {steps} | {at['cpu_s'] / 60:.1f} "
+            cells = f"{at['wall_s'] / 60:.1f} | {known['wall_s'] / 60:.1f} | {steps} | {at['cpu_s'] / 60:.1f} "
         lines.append(f"| {run['seed']} | {cells}|")
     median_s = statistics.median(times_s(result))
     if math.isfinite(median_s):

@@ -167,7 +167,8 @@ def test_a_seed_that_was_there_is_not_run_again(tmp_path, monkeypatch, capsys):
         asked.append((seed, budget))
         at = {"wall_s": 60.0, "cpu_s": 60.0, "env_steps": 1e6, "iteration": 9}
         there = seed != 4
-        return {"seed": seed, "reached": there, "max_env_steps": budget, "at": at if there else None, "curve": [at]}
+        curve = [at, at | {"wall_s": 90.0}, at | {"wall_s": 120.0}]
+        return {"seed": seed, "reached": there, "max_env_steps": budget, "at": at if there else None, "curve": curve}
 
     def command(*words):
         monkeypatch.setattr(sys, "argv", ["time_to_skill", "--json", str(file), *words])
@@ -178,7 +179,9 @@ def test_a_seed_that_was_there_is_not_run_again(tmp_path, monkeypatch, capsys):
     assert command("--seeds", "2-4", "--max-env-steps", "200") == 0
     assert asked == [(3, 100), (4, 100), (2, 200), (4, 200)]  # seed 4 was not there within fewer
     assert [run["seed"] for run in json.loads(file.read_text())["runs"]] == [2, 3, 4]
-    assert "Median: 1.0 minutes" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "| 3 | 1.0 | 2.0 | 1.00 M | 9 | 1.0 |" in printed
+    assert "Median: 1.0 minutes" in printed
     assert command("--set", "game.bob_steps=3") == 2
     assert "something else as set, recipe; name another file" in capsys.readouterr().err
 

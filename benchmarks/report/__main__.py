@@ -114,7 +114,13 @@ class Report:
                 recipe.check_words(self._docs / page, words, found["time_to_skill"])
         seeds = read_all(self._results / "seeds")
         headline = {"headline": [comparison.headline_table(trials)]}
-        judged = f"{pretraining.seeds_words(seeds[SEEDS])}\n{time_to_skill.words(found['time_to_skill'])}"
+        judged = "\n".join(
+            (
+                pretraining.seeds_words(seeds[SEEDS]),
+                time_to_skill.words(found["time_to_skill"]),
+                scaling.words(found["scaling_box"]),
+            )
+        )
         made = measured_blocks(found) | {
             "results/pretraining.md": self.pretraining_blocks(runs, found, seeds),
             "results/skills.md": self.skills_blocks(recorded_skills, controls, runs),

@@ -78,6 +78,7 @@ _RANDOM = _Panel(
         _Curve("evaluation/air_success_ever", "air, ever", ORANGE, dashed=True),
         _Curve("evaluation/air_success_last", "air, last", ORANGE),
         _Curve("evaluation/mixed_success_last", "mixed, last", BLUE),
+        _Curve("evaluation/one_success_last", "one, last", "#CC79A7"),
     ),
 )
 _SELF_PLAY = (

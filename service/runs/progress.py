@@ -19,6 +19,7 @@ _PATTERNS = {
     "evaluation/mixed_success_last": "{:.0%}",
     "evaluation/table_success_last": "{:.0%}",
     "evaluation/air_success_last": "{:.0%}",
+    "evaluation/one_success_last": "{:.0%}",
     "evaluation/coverage": "{:.0%}",
 }
 """Metrics that are shown, where a run has them."""

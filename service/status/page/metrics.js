@@ -13,7 +13,7 @@ export const OVERVIEW = [
   {
     title: "Bob on random goals",
     hint: "success at the last step of an evaluation; grows",
-    curves: [["evaluation/mixed_success_last", "mixed"], ["evaluation/air_success_last", "air"], ["evaluation/table_success_last", "table"]],
+    curves: [["evaluation/mixed_success_last", "mixed"], ["evaluation/air_success_last", "air"], ["evaluation/table_success_last", "table"], ["evaluation/one_success_last", "one object"]],
   },
   { title: "Goals", hint: "grow while Alice proposes harder goals", curves: [["alice/goal_distance_m", "distance"], ["alice/goal_height_m", "height"]] },
   { title: "Throughput", hint: "env steps per second", curves: [["time/env_steps_per_s", "env steps/s"]] },
