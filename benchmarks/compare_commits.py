@@ -1,8 +1,7 @@
-"""Env steps a second at two commits, of self-play, bare worlds or learning a task, in turn on the same cores.
+"""Env steps a second at two commits, of self-play or of bare worlds, in turn on the same cores.
 
     python -m benchmarks.compare_commits 10399f0 HEAD --json docs/results/throughput.json
     python -m benchmarks.compare_commits 2b220b3^ HEAD --worlds --json docs/results/world_speed.json
-    python -m benchmarks.compare_commits f0b7427 HEAD --task wall --seconds 20
 
 Each commit is checked out into a worktree of its own and trains with its own shipped configuration for the same number
 of env steps, since policies that touch the object make its physics dearer. From there a number of iterations is
@@ -11,9 +10,7 @@ for bit, so what differs between them is the machine. Learning is part of it, an
 and records that fall into 20 iterations. Only the command line is used, which all commits have.
 
 Bare worlds play episodes of random actions in the world of their commit's recipe, with one thread: what an actor does
-but for its policies. With few worlds NumPy's calls weigh most, with many its arithmetic. A task is learned with the
-champion's primitives, without evaluations and on one thread, for at most 300,000 env steps; its settings are its own:
-64 worlds, several large updates after a step of all.
+but for its policies. With few worlds NumPy's calls weigh most, with many its arithmetic.
 """
 
 from __future__ import annotations
@@ -54,26 +51,6 @@ play()
 print(json.dumps(asdict(measure(play, float(sys.argv[2])))))
 """
 """What runs with the code of a commit."""
-_LEARN_TASK = """
-import json, sys
-from dataclasses import asdict
-import torch
-import service
-from benchmarks.measuring import measure
-from service.config.task import TaskConfig
-from service.methods.task import TaskLearning
-torch.set_num_threads(1)
-trained = service.load_primitives("panda-cube@champion", "no registry")
-config = TaskConfig(task=sys.argv[1], method="ours", world=trained.config.world, run={"num_threads": 1})
-learning = TaskLearning(config, trained)
-def play():
-    before = learning.num_env_steps
-    learning.step()
-    return learning.num_env_steps - before
-for _ in range(3):  # by then it learns
-    play()
-print(json.dumps(asdict(measure(play, float(sys.argv[2])))))
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,15 +63,13 @@ class Settings:
     """A later one."""
     worlds: bool = False
     """Bare worlds, 8 and 240, not self-play."""
-    task: str = ""
-    """One that is learned; empty: self-play."""
     trained_steps: int = 500_000
     """Env steps of training before the first measurement."""
     num_pairs: int = 5
     num_iterations: int = 20
     """Iterations of each measurement, with the evaluations and checkpoints that fall into them."""
     seconds: float = 2.0
-    """Length of each measurement of bare worlds, or of a task."""
+    """Length of each measurement of bare worlds."""
 
 
 @contextmanager
@@ -178,13 +153,11 @@ def benchmark(settings: Settings) -> dict[str, Any]:
     if commits["old"] == commits["new"]:
         raise TandemError(f"{settings.old} and {settings.new} are the same commit; name two")
     with worktree(commits["old"]) as before, worktree(commits["new"]) as after, scratch() as home:
-        if settings.task or settings.worlds:
-            name = "task_speed" if settings.task else "world_speed"
-            program, asked = (_LEARN_TASK, [settings.task]) if settings.task else (_PLAY_WORLDS, NUM_WORLDS)
-            found = compare_programs(program, asked, {"old": before, "new": after}, home, settings)
+        if settings.worlds:
+            found = compare_programs(_PLAY_WORLDS, NUM_WORLDS, {"old": before, "new": after}, home, settings)
             rows = {num: {name: rates(each) for name, each in samples.items()} for num, samples in found.items()}
             ratios = {num: ratio(samples["new"], samples["old"]) for num, samples in found.items()}
-            return {"benchmark": name, "commits": commits, "rows": rows, "ratios": ratios}
+            return {"benchmark": "world_speed", "commits": commits, "rows": rows, "ratios": ratios}
         first, last = names = [commit[:7] for commit in commits.values()]
         samples = compare(dict(zip(names, (before, after), strict=True)), home, settings)
     rows = {name: rates(each) for name, each in samples.items()}

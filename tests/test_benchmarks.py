@@ -33,7 +33,6 @@ from service.runs.train import open_run
 from service.store.run_directory import RunDirectory
 from service.store.run_history import RunHistory
 from tests.runs.runs import tiny_config
-from tools import mutation
 
 ROOT = Path(__file__).parents[1]
 
@@ -403,13 +402,3 @@ def test_two_commits_are_trained_and_then_measured_in_turn(tmp_path, monkeypatch
 def test_a_commit_is_not_compared_with_itself():
     with pytest.raises(TandemError, match="the same commit"):
         compare_commits.benchmark(compare_commits.Settings("HEAD", "HEAD"))
-
-
-# --- mutation ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("line", "statement"), [(1, [1, 2]), (2, [1, 2]), (3, [3]), (4, [4, 5, 6]), (6, [4, 5, 6])])
-def test_the_statement_that_a_mutant_is_in(line, statement):
-    """A decorator is a part of its class, and the head of a class is a statement of its own."""
-    code = "@dataclass\nclass Box:\n    size = 1\n    sizes = (\n        2,\n    )\n"
-    assert list(mutation.statement(code, line)) == statement

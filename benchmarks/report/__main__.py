@@ -25,7 +25,7 @@ from benchmarks.run_files import Run
 from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
 
-FILES = ("env_throughput", "throughput", "world_speed", "deployed", "mutation", "scaling_box", "robots",
+FILES = ("env_throughput", "throughput", "world_speed", "deployed", "scaling_box", "robots",
          "time_to_skill", "transfer", "transfer_champion", "demo")  # fmt: skip
 """Names of the recorded files of which there is one each."""
 PAGES = {
@@ -47,7 +47,7 @@ PAGES = {
     "downstream.md": ("headline",),
     "robots.md": ("robots",),
     "results/transfer.md": ("transfer", "transfer_champion"),
-    "results/README.md": ("throughput", "mutation"),
+    "results/README.md": ("throughput",),
     "../README.md": ("seeds", "headline"),
     "scaling.md": ("box", "model"),
     "hardware.md": ("demo",),
@@ -208,7 +208,7 @@ class Report:
 
 def measured_blocks(found: Results) -> dict[str, Blocks]:
     """Parts of the blocks that are of one recorded file each, by page."""
-    deployed, robots, mutants = found["deployed"], found["robots"], found["mutation"]
+    deployed, robots = found["deployed"], found["robots"]
     speed = measured.speed_words(found["world_speed"])
     return {
         "results/deployed.md": {"checks": [measured.checks_words(deployed), measured.checks_table(deployed)]},
@@ -218,10 +218,7 @@ def measured_blocks(found: Results) -> dict[str, Blocks]:
             for name in PAGES["results/transfer.md"]
         },
         "hardware.md": {"demo": [measured.demo_table(found["demo"]), measured.demo_words(found["demo"])]},
-        "results/README.md": {
-            "throughput": [measured.ratios_block(found["env_throughput"])],
-            "mutation": [measured.mutation_words(mutants), measured.mutation_table(mutants)],
-        },
+        "results/README.md": {"throughput": [measured.ratios_block(found["env_throughput"])]},
     }
 
 

@@ -1,4 +1,4 @@
-"""Blocks about a deployment, robots, speed and mutation testing, in Markdown, each from one recorded file."""
+"""Blocks about a deployment, robots and speed, in Markdown, each from one recorded file."""
 
 from __future__ import annotations
 
@@ -9,21 +9,6 @@ from typing import Any
 from benchmarks.report.markdown import cell, measured_on, percent, table
 
 Result = Mapping[str, Any]
-SURVIVED = "survived"
-AS_BEFORE = {
-    ("learner/sac_networks.py", "nn.ReLU(inplace=False)"): "the same numbers, from more memory",
-    ("methods/compose.py", 'trained.kind >= "skills"'): "no kind has a greater name",
-    ("methods/task.py", "generate_state(1)[0])"): "another stream of random numbers, as good as this",
-    ("runs/study_run.py", "file.seek( -1, os.SEEK_END)"): "a byte more of the last 100,000",
-    ("learner/learner.py", "incarnation), ~1)"): "a sequence is never negative",
-    ("export/formats.py", "slots=False"): "takes more memory",
-    ("cluster/ray_connection.py", "slots=False"): "takes more memory",
-    ("status/run_details.py", "which.reshape(~1)"): "NumPy takes -2 as -1",
-    ("status/stream.py", '["iteration"] or 1'): "an iteration is never missing or 0",
-    ("store/disk_reader.py", "@override"): "for who reads the code",
-    ("envs/kinematics.py", "strict=False"): "a guard: the lengths never differ",
-}
-"""Why a survivor behaves as before, judged by hand, by its file and a part of its changed line."""
 
 
 def ratios_block(result: Result) -> str:
@@ -159,47 +144,3 @@ def _self_play(run: Result) -> str:
         f"after {run['env_steps'] / 1e6:.1f} M env steps {shares['valid_fraction']} of Alice's goals are valid and "
         f"{shares['lifted_fraction']} in the air; Bob reaches {shares['success_rate']}"
     )
-
-
-def mutation_words(result: Result) -> str:
-    """How many mutants the tests notice, and how many of the others behave as before."""
-    mutants = result["mutants"]
-    survivors = [each for each in mutants if each["outcome"] == SURVIVED]
-    killed, same = len(mutants) - len(survivors), sum(_reason(each) is not None for each in survivors)
-    return (
-        f"Of {len(mutants)} mutants of {', '.join(result['settings']['packages'])} the tests notice {killed}, "
-        f"{percent(killed / len(mutants), 1)}; at least 88 % were asked for. Of the {len(survivors)} others {same} "
-        f"behave as before.{measured_on(result['recorded'])}"
-    )
-
-
-def mutation_table(result: Result) -> str:
-    """Every survivor: where, its changed line, and why it behaves as before, if it does."""
-    rows = [
-        (
-            f"{_file(each)}:{each['line']}",
-            " ".join(f"`{cell(line)}`" for line in _changed(each)),
-            _reason(each) or "**no test**",
-        )
-        for each in result["mutants"]
-        if each["outcome"] == SURVIVED
-    ]
-    return table(("in `service/`", "survived", "why"), rows)
-
-
-def _file(mutant: Result) -> str:
-    return str(mutant["file"]).removeprefix("service/")
-
-
-def _changed(mutant: Result) -> list[str]:
-    """Its changed lines; those that were taken away, where nothing was written instead."""
-    for sign in "+-":
-        lines = [line[1:].strip() for line in mutant["diff"] if line.startswith(sign)]
-        if any(lines):
-            return [line for line in lines if line]
-    raise AssertionError(f"{mutant['file']}:{mutant['line']} changes nothing")
-
-
-def _reason(mutant: Result) -> str | None:
-    text = "\n".join(_changed(mutant))
-    return next((why for (file, part), why in AS_BEFORE.items() if file == _file(mutant) and part in text), None)

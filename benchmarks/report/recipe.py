@@ -11,6 +11,7 @@ from benchmarks.report.markdown import commit
 from service.base.errors import TandemError
 from service.config import load_config
 from service.config.self_play import SelfPlayConfig
+from service.config.tree import leaves
 
 SHIPPED = "the shipped recipe"
 _OF_ONE_RUN = ("name", "seed", "run.")
@@ -26,8 +27,8 @@ def differences(recorded: Mapping[str, Any], other: Mapping[str, Any] | None = N
         recorded: as the recorded file has it; keys that are newer have their defaults.
         other: the same; None: the shipped recipe.
     """
-    mine = _leaves(_tree(recorded))
-    others = _leaves(_tree(other if other is not None else load_config(RECIPE_FILE).model_dump(mode="json")))
+    mine = dict(leaves(_tree(recorded)))
+    others = dict(leaves(_tree(other if other is not None else load_config(RECIPE_FILE).model_dump(mode="json"))))
     return {
         key: (mine.get(key), others.get(key))
         for key in sorted({*mine, *others})
@@ -66,11 +67,4 @@ def _filled(defaults: Mapping[str, Any], recorded: Mapping[str, Any]) -> dict[st
     for key in defaults.keys() & recorded.keys():
         both = isinstance(defaults[key], dict) and isinstance(recorded[key], dict)
         found[key] = _filled(defaults[key], recorded[key]) if both else recorded[key]
-    return found
-
-
-def _leaves(tree: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    found = dict[str, Any]()
-    for key, value in tree.items():
-        found |= _leaves(value, f"{above}{key}.") if isinstance(value, dict) else {f"{above}{key}": value}
     return found

@@ -8,7 +8,6 @@ from typing import Annotated
 
 import typer
 
-from service.base.errors import TandemError
 from service.base.version import __version__
 from service.cli.common import CommandGroup, QuietOption, quieten
 from service.cli.configs import configs_app, methods, tasks
@@ -30,25 +29,6 @@ for command in (demo, evaluate, coverage, render, play, dataset, export, publish
 app.add_typer(registry_app)
 app.add_typer(robot_app)
 app.add_typer(configs_app)
-
-_DOWNSTREAM = {
-    "train": "tandem train TASK --method NAME --primitives X --set seed=N --set run.total_env_steps=N",
-    "table": "tandem train push,wall --method ours,ours-her --seeds 0-2",
-    "publish": "tandem publish RUN --name NAME --alias ALIAS",
-    "methods": "tandem methods",
-    **{verb: f"tandem {verb} X --task NAME" for verb in ("evaluate", "render", "play")},
-}
-"""The commands of today for those of version 0.2."""
-
-
-@app.command(hidden=True, context_settings={"ignore_unknown_options": True, "help_option_names": []})
-def downstream(
-    verb: Annotated[str, typer.Argument()] = "", rest: Annotated[list[str] | None, typer.Argument()] = None
-) -> None:
-    """Say what to type now: this was a group of commands until version 0.2."""
-    raise TandemError(
-        f"tandem downstream {verb} is now {_DOWNSTREAM.get(verb, ', '.join(_DOWNSTREAM.values()))}; see docs/cli.md"
-    )
 
 
 def _say_version(asked: bool) -> None:

@@ -269,11 +269,6 @@ class LearnerConfig(FrozenModel):
     num_threads: int = Field(
         1, ge=1, description="torch threads; one leaves the other core to the worlds, and two spin when a core is taken"
     )
-    bfloat16: bool = Field(
-        False,
-        description="multiply in bfloat16 inside hidden layers, where a processor has it in two thirds of the time; "
-        "what is learned then depends on the machine",
-    )
     alice: PPOConfig = PPOConfig()
     bob: BobPPOConfig = BobPPOConfig()
     bob_ema_decay: float = Field(

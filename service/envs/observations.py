@@ -223,7 +223,7 @@ def layouts(world: WorldConfig) -> Layouts:
 
 PAPER = Layouts()
 """Layouts of the paper, which worlds have unless their configuration says otherwise."""
-FULL, BOB, BOB_VALUE, GATE, SPACES = PAPER.full, PAPER.bob, PAPER.bob_value, PAPER.gate, PAPER.spaces
+FULL, BOB, BOB_VALUE, SPACES = PAPER.full, PAPER.bob, PAPER.bob_value, PAPER.spaces
 
 
 def each_object(rows: NDArray[Any]) -> NDArray[Any]:

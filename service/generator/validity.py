@@ -7,7 +7,7 @@ import enum
 import numpy as np
 from numpy.typing import NDArray
 
-from service.base.types import BoolArray, StateArray
+from service.base.types import BoolArray, FloatArray, StateArray
 from service.config import WorkspaceConfig
 from service.envs.observations import distances, each_object
 
@@ -24,7 +24,7 @@ class Verdict(enum.IntEnum):
     FALLEN = 3
 
 
-def in_workspace(position: StateArray, workspace: WorkspaceConfig) -> BoolArray:
+def in_workspace(position: FloatArray | StateArray, workspace: WorkspaceConfig) -> BoolArray:
     """Whether each (..., 3) position in metres lies in the box, its faces included; not-a-number lies outside."""
     inside: BoolArray = np.all((position >= workspace.lower_m) & (position <= workspace.upper_m), axis=-1)
     return inside

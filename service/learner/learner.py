@@ -64,9 +64,6 @@ class Learner:
             value = config.policy.value
             alice = networks.make_alice(config.policy, seen), networks.ValueNetwork(seen.full.normalisation, value)
             bob = networks.make_bob(config.policy, seen), networks.ValueNetwork(seen.bob_value.normalisation, value)
-        if config.learner.bfloat16:
-            for network in (*alice, *bob):
-                networks.use_bfloat16(network)
         self._alice = Player(*alice, config.learner.alice, self._device)
         self._bob = Player(*bob, config.learner.bob, self._device)
         self._bob_policy = bob[0]

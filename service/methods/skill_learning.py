@@ -15,6 +15,7 @@ from service.config import WorkspaceConfig
 from service.config.skills import SkillDiscoveryConfig, SkillsConfig
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.observations import POSITIONS
+from service.generator.validity import in_workspace
 from service.learner.off_policy import OffPolicyLoop, TabletopWorlds
 from service.learner.replay import Columns, ReplayBuffer
 from service.learner.sac import Batch, SACLearner
@@ -157,11 +158,10 @@ def see_object(rows: Columns, workspace: WorkspaceConfig) -> Seen:
     has earned. Else the longest way of all would be that of a cube pushed off the table, which falls for ever.
     """
     previous, positions, following, start, skill = (rows[name] for name in (*_COLUMNS, "skill"))
-    lower, upper = np.array(workspace.lower_m), np.array(workspace.upper_m)
     seen: list[FloatArray] = []
     stepped: BoolArray = np.ones(len(start), dtype=np.bool_)
     for place in (positions[:, _OBJECT], following[:, _OBJECT]):
-        inside: BoolArray = np.all((place >= lower) & (place <= upper), axis=1)
+        inside = in_workspace(place, workspace)
         seen.append(normalised_place(np.where(inside[:, None], place, start)))
         stepped &= inside
     inputs = skill_inputs(previous, positions, skill), skill_inputs(positions, following, skill)

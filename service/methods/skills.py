@@ -21,6 +21,7 @@ from service.base.user_code import CodeError, checked, naming_errors_of, recorde
 from service.config import parse_config
 from service.config.skills import SKILLS_OF, SkillDiscoveryConfig, SkillsConfig
 from service.generator.bins import CELL_SIZE_M, GoalCells, in_air
+from service.generator.validity import in_workspace
 from service.methods.intrinsic_reward import IntrinsicReward
 from service.methods.method import Iteration, Method, State, goal_grid
 from service.methods.rewards import find_reward
@@ -114,8 +115,7 @@ class SkillDiscovery(Method):
         start, end = np.stack(self._worlds.finished).astype(np.float64).swapaxes(0, 1)
         self._worlds.finished.clear()
         distance = np.linalg.norm(end - start, axis=1)
-        lower, upper = self._cells.bounds_m
-        inside = ((end >= lower) & (end <= upper)).all(axis=1)
+        inside = in_workspace(end, self._config.world.workspace)
         moved = inside & (distance > self._config.success_distance_m)
         self._visits += self._cells.count(self._cells.index(end[moved]))
         lifted = inside & in_air(end, self._config.world.rest_height_m)

@@ -78,21 +78,9 @@ class InputNormalisation(nn.Module):
 class HiddenLayer(nn.Linear):
     """A linear layer followed by ELU."""
 
-    in_bfloat16 = False
-    """Multiply in bfloat16, forward and backward; parameters, sums and ELU stay in float32."""
-
     def forward(self, values: Tensor) -> Tensor:
         """Map (..., inputs) to (..., outputs)."""
-        with torch.autocast(values.device.type, torch.bfloat16, enabled=self.in_bfloat16):
-            product = super().forward(values)
-        return elu(product.float())
-
-
-def use_bfloat16(network: nn.Module) -> None:
-    """Let the hidden layers of a network, where nearly all of its work is, multiply in bfloat16."""
-    for module in network.modules():
-        if isinstance(module, HiddenLayer):
-            module.in_bfloat16 = True
+        return elu(super().forward(values))
 
 
 def hidden_layers(input_size: int, hidden_sizes: Sequence[int]) -> nn.Sequential:

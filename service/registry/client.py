@@ -33,18 +33,15 @@ URL_VARIABLE, REGISTRY_VARIABLE = "TANDEM_URL", "TANDEM_REGISTRY"
 _TIMEOUT = httpx.Timeout(20.0, connect=5.0)
 
 
-def fetch_primitives(
-    url: str, reference: str, *, token: str | None = None, cache_dir: Path | None = None
-) -> tuple[Registry, Version]:
+def fetch_primitives(url: str, reference: str, *, cache_dir: Path | None = None) -> tuple[Registry, Version]:
     """Fetch a version from a status service.
 
-    An alias is resolved by the service each time; parameters are fetched only once.
+    An alias is resolved by the service each time; parameters are fetched only once. The token of ``TANDEM_TOKEN`` is
+    sent only to the service that ``TANDEM_URL`` or ``TANDEM_REGISTRY`` names.
 
     Args:
         url: URL of the service, such as ``http://lab:8321``.
         reference: NAME, NAME@VERSION or NAME@ALIAS.
-        token: token of the service; None for that of ``TANDEM_TOKEN``, which is sent only to the service that
-            ``TANDEM_URL`` or ``TANDEM_REGISTRY`` names.
         cache_dir: directory of fetched registries; None for ``~/.cache/tandem/registries``.
 
     Returns:
@@ -63,8 +60,7 @@ def fetch_primitives(
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tandem" / "registries"
     registry = Registry((cache_dir or caches) / directory)
     configured = {os.environ.get(variable, "").rstrip("/") for variable in (URL_VARIABLE, REGISTRY_VARIABLE)}
-    if token is None and base in configured:  # the environment's token is for this service, not for any URL
-        token = read_token()
+    token = read_token() if base in configured else None  # it is for this service, not for any URL
     headers = {"Authorization": f"Bearer {token}"} if token else {}
     with httpx.Client(base_url=base, headers=headers, timeout=_TIMEOUT) as service:
         data = _get(service, f"/v1/primitives/{name}/versions/{target}")
@@ -111,7 +107,7 @@ def _refusal(base: str, response: httpx.Response) -> TandemError:
         )
     detail = f"{base} says: {one_line(str(problem['detail']), 500)}"
     if response.status_code == httpx.codes.UNAUTHORIZED:
-        return WrongTokenError(f"{detail}; set {VARIABLE} to it and {URL_VARIABLE} to this URL, or give token=")
+        return WrongTokenError(f"{detail}; set {VARIABLE} to it and {URL_VARIABLE} to this URL")
     if problem.get("type") == "urn:tandem:unknown-version":
         return UnknownVersionError(detail)
     if problem.get("type") == "urn:tandem:damaged":

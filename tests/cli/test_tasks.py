@@ -2,11 +2,9 @@
 
 import json
 import os
-import re
 import signal
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from service.base.lock import DirectoryLock
@@ -175,21 +173,6 @@ def test_methods_and_tasks_are_listed():
     assert all(5 < len(row["about"]) < 110 for row in methods.values())
     listed = tandem("tasks").stdout.splitlines()
     assert [line.partition("\t")[0] for line in listed[:3]] == ["name", "larger", "inair"]
-
-
-@pytest.mark.parametrize(
-    "typed", ["train --task wall --seed 0 --help", "evaluate x -q", "publish x", "methods", "lift"]
-)
-def test_commands_of_before_name_those_of_now(typed):
-    refused = tandem("downstream", *typed.split())
-    assert_refused(refused, "is now tandem")
-    commands = typer.main.get_command(app).commands
-    named = re.findall(r"(?:now|,) tandem (\w+)", refused.stderr)
-    assert named[0] == (typed.split()[0] if typed != "lift" else "train")
-    assert set(named) <= commands.keys() - {"downstream"}
-    assert set(re.findall(r" (--\w+)", refused.stderr)) <= {
-        option for command in commands.values() for each in command.params for option in each.opts
-    }
 
 
 @pytest.mark.parametrize(

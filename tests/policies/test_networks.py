@@ -20,7 +20,6 @@ from service.policies.networks import (
     export_parameters,
     make_alice,
     make_bob,
-    use_bfloat16,
 )
 from service.policies.parameters import FloatArray
 
@@ -194,16 +193,3 @@ def test_elu_is_torchs_with_its_gradient() -> None:
     assert torchs.grad is not None
     np.testing.assert_allclose(ours.grad, torchs.grad, atol=3e-7)
     assert torch.equal(elu(torch.tensor([torch.nan, torch.inf])).isnan(), torch.tensor([True, False]))
-
-
-def test_bfloat16_is_for_products_of_hidden_layers_only(bob: MCPPolicy, observe: Observe) -> None:
-    rows = torch.tensor(observe(50, BOB.size))
-    exact = torch.cat(bob(rows))
-    use_bfloat16(bob)
-    rounded = torch.cat(bob(rows))
-    assert rounded.dtype == torch.float32
-    assert 1e-4 < (rounded - exact).abs().mean() < 0.02  # bfloat16 has 8 bits
-    rounded.square().mean().backward()
-    for name, parameter in bob.named_parameters():
-        assert parameter.grad is not None, name
-        assert parameter.grad.dtype == torch.float32, name

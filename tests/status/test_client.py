@@ -180,12 +180,14 @@ def test_the_token(home, tmp_path, monkeypatch):
         with pytest.raises(WrongTokenError) as error:
             fetch_primitives(server.url, "tiny", cache_dir=tmp_path)
         assert_one_line(error.value, server.url, "a token is needed", "TANDEM_TOKEN")
+        monkeypatch.setenv("TANDEM_URL", server.url)
+        monkeypatch.setenv("TANDEM_TOKEN", WRONG)
         with pytest.raises(WrongTokenError) as error:
-            fetch_primitives(server.url, "tiny", token=WRONG, cache_dir=tmp_path)
+            fetch_primitives(server.url, "tiny", cache_dir=tmp_path)
         assert_one_line(error.value, "wrong token")
         assert WRONG not in str(error.value)
-        assert fetch_primitives(server.url, "tiny", token=TOKEN, cache_dir=tmp_path)[1].number == 2
         monkeypatch.setenv("TANDEM_TOKEN", TOKEN)
+        monkeypatch.delenv("TANDEM_URL")
         for variable in ("TANDEM_URL", "TANDEM_REGISTRY"):
             with pytest.raises(WrongTokenError) as error:  # it may be anybody's URL
                 fetch_primitives(server.url, "tiny", cache_dir=tmp_path)
