@@ -42,7 +42,7 @@ PAGES = {
         "throughput",
     ),
     "results/deployed.md": ("checks",),
-    "results/skills.md": ("coverage", "curves", "controls"),
+    "results/skills.md": ("coverage", "curves"),
     "results/comparison.md": ("rows", "longer", "below", "harder", "missing"),
     "downstream.md": ("headline",),
     "robots.md": ("robots",),
@@ -104,16 +104,16 @@ class Report:
         """Write all pages and pictures."""
         found = read_all(self._results, FILES)
         runs = [run for run in read_all(self._results / "runs").values() if "ablation" not in run]
-        trials, longer, recorded_skills, controls = (
-            list(read_all(self._results / name).values())
-            for name in ("downstream", "downstream_longer", "skills", "controls")
+        trials, longer, recorded_skills = (
+            list(read_all(self._results / name).values()) for name in ("downstream", "downstream_longer", "skills")
         )
         for page, names in PAGES.items():  # what is wrong with a page is found before anything is drawn
             words = replace_blocks(self._docs / page, dict.fromkeys(names, ""))
             if page in ABOUT_THE_RECIPE:
                 recipe.check_words(self._docs / page, words, found["time_to_skill"])
         seeds = read_all(self._results / "seeds")
-        headline = {"headline": [comparison.headline_table(trials)]}
+        coming = list(read_all(self._results / RESULTS.name / "downstream").values())
+        headline = {"headline": [comparison.headline_table(trials, coming)]}
         judged = "\n".join(
             (
                 pretraining.seeds_words(seeds[SEEDS]),
@@ -123,7 +123,7 @@ class Report:
         )
         made = measured_blocks(found) | {
             "results/pretraining.md": self.pretraining_blocks(runs, found, seeds),
-            "results/skills.md": self.skills_blocks(recorded_skills, controls, runs),
+            "results/skills.md": self.skills_blocks(recorded_skills),
             "results/comparison.md": self.comparison_blocks(trials, longer),
             "downstream.md": headline,
             "../README.md": headline | {"seeds": [judged]},
@@ -175,15 +175,14 @@ class Report:
             "throughput": [pretraining.throughput_words(found["throughput"])],
         }
 
-    def skills_blocks(self, runs: Sequence[Run], controls: Sequence[Run], pretrained: Sequence[Run]) -> Blocks:
-        """Parts of the blocks about skills, and about controls of self-play."""
+    def skills_blocks(self, runs: Sequence[Run]) -> Blocks:
+        """Parts of the blocks about skills."""
         stages = self.show("Random skills at three stages of training", "skills", figures.draw_skills, runs)
         learned = [run for run in runs if run["method"] != "ours"]
         curves = self.show("Skill discovery over env steps", "skills-curves", figures.draw_skill_curves, learned)
         return {
             "coverage": [skills.coverage_table(runs), stages],
             "curves": [curves],
-            "controls": [skills.controls_table(controls), skills.alike_table([*pretrained, *controls])],
         }
 
     def comparison_blocks(self, trials: Sequence[Result], longer: Sequence[Result]) -> Blocks:

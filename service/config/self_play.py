@@ -93,7 +93,7 @@ class GameConfig(FrozenModel):
         return self
 
 
-GOAL_SOURCES = ("alice", "reached", "uniform", "table", "learnable")
+GOAL_SOURCES = ("alice", "reached", "uniform")
 
 
 class GeneratorConfig(FrozenModel):
@@ -108,10 +108,9 @@ class GeneratorConfig(FrozenModel):
         "alice",
         description="of the goals that Bob plays besides those that Alice has just proposed. alice: her earlier ones. "
         "reached: new ones in cells to which either player has brought the object in a game, and in cells beside "
-        "these, weighted by p (1 - p) of tasks like them. Controls: uniform, drawn as those of an evaluation; table, "
-        "anywhere on it; learnable, uniform goals weighted by p (1 - p) (SFL, Rutherford et al. 2024). All but alice's "
-        "begin where worlds are now, and every second with the object in the hand once there are such starts. Or "
-        "FILE.py:CLASS, a GoalSource of yours",
+        "these, weighted by p (1 - p) of tasks like them (SFL, Rutherford et al. 2024). uniform, to compare with: "
+        "drawn as those of an evaluation. All but alice's begin where worlds are now, and every second with the "
+        "object in the hand once there are such starts. Or FILE.py:CLASS, a GoalSource of yours",
     )
     replay_fraction: float = Field(
         0.0,
@@ -328,7 +327,7 @@ class SelfPlayConfig(Config):
             generator.goal_source in ("alice", "reached") or not generator.replay_invalid
         ):
             raise ValueError(
-                "without Alice there are no goals: set generator.goal_source to uniform, table or learnable, and "
+                "without Alice there are no goals: set generator.goal_source=uniform and "
                 "generator.replay_invalid=true, or game.alice_plays=true"
             )
         game, how = self.game, self.learner.self_imitation

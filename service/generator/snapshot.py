@@ -14,7 +14,7 @@ from service.base.types import Array, Arrays, BoolArray, IntArray, StateArray
 from service.config import WorldConfig
 from service.config.self_play import GOAL_SOURCES, SelfPlayConfig
 from service.envs.observations import distances, each_object
-from service.envs.sampling import GoalKind, are_apart, inside_obstacles, sample_goals
+from service.envs.sampling import are_apart, inside_obstacles, sample_goals
 from service.envs.state_layout import places_at
 from service.generator.bins import AIR_ABOVE_REST_M, GoalCells, TaskBins, highest, in_air
 from service.generator.opponents import RoundPlan
@@ -205,14 +205,13 @@ class GeneratorSnapshot:
         source = self.config.generator.goal_source
         if source not in GOAL_SOURCES:
             return self._own_source.goals(rng)
-        kind: GoalKind = "table" if source == "table" else "mixed"
-        goal = sample_goals(kind, rng, NUM_DRAWN, self.config.world, self.config.game.success_distance_m)
+        goal = sample_goals("mixed", rng, NUM_DRAWN, self.config.world, self.config.game.success_distance_m)
         return goal[self._near(goal)] if source == "reached" else goal
 
     def _weight(self, goal: StateArray, start_state: StateArray, start_position: StateArray) -> StateArray:
         """(M,) weights of tasks: what Bob can learn from each, all alike, or what a user's source says."""
         source = self.config.generator.goal_source
-        if source in ("uniform", "table"):
+        if source == "uniform":
             return np.ones(len(goal))
         weight: StateArray = self.learnability[self.tasks.index(goal, start_position, start_state)]
         if source in GOAL_SOURCES:
