@@ -98,7 +98,8 @@ def play(
     Args:
         bridge: plays the policy on the back-end's robot.
         backend: the robot.
-        policy: says which goals are drawn, and what counts as reached.
+        policy: says which goals are drawn, and what counts as reached; of a user's task whose goals are a function,
+            those of the kind that comes nearest.
         goal_m: (3,) the goal of all episodes; None: random ones.
         num_episodes: how many.
         num_steps: of each.
@@ -112,7 +113,7 @@ def play(
     places = draw_objects(rng, num_episodes, policy.world)
     goals = np.zeros((num_episodes, 3))
     if goal_m is None:
-        goals = draw_goals(policy.goal_kind, rng, policy.world, policy.success_distance_m, places)
+        goals = draw_goals(policy.tried_on.goal_kind, rng, policy.world, policy.success_distance_m, places)
     for episode in range(num_episodes):
         if backend.simulator is not None:
             backend.begin(places.object[episode])
@@ -134,7 +135,7 @@ def _goal_from(backend: Backend, rng: np.random.Generator, policy: Trained) -> S
     if policy.world.fixture == "box":
         raise RobotError(f"{policy.label} brings the object into a box, and nothing tells a bridge where it is: --goal")
     places = Places(object_m[None], np.empty((1, 0)), np.empty((1, 0, 3)))
-    goal: StateArray = draw_goals(policy.goal_kind, rng, policy.world, policy.success_distance_m, places)[0]
+    goal: StateArray = draw_goals(policy.tried_on.goal_kind, rng, policy.world, policy.success_distance_m, places)[0]
     return goal
 
 

@@ -1,10 +1,14 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from service.base.errors import TandemError
+from service.envs.task import Task
 from service.registry.bundled import BUNDLED
 from service.registry.loading import load
-from service.robot.running import for_robot
+from service.robot.running import for_robot, play
 from tests.export.policies import publish_bob, write_training
 from tests.methods.skill_sets import made
 
@@ -27,3 +31,14 @@ def test_what_is_no_policy_for_a_robot(champion, tmp_path):
         for_robot(load(str(tmp_path / "alone"), BUNDLED))
     with pytest.raises(TandemError, match="made@1 is a set of skills of lsd; tandem robot needs primitives"):
         for_robot(made())
+
+
+def test_a_policy_of_a_users_task_plays_goals_of_the_nearest_kind(tmp_path):
+    """Of what is published a robot runs no code."""
+    task = Task("Mine", goals="air", closed="code of its publisher")
+    policy = replace(for_robot(load("panda-cube@champion", tmp_path)), task=task)
+    bridge = SimpleNamespace(run=lambda goal_m, num_steps: 0.04)
+    given = {"goal_m": None, "num_episodes": 5, "num_steps": 1, "seed": 0, "ready": lambda episode, goal_m: None}
+    outcomes = list(play(bridge, SimpleNamespace(simulator=None), policy, **given))
+    assert [outcome.reached for outcome in outcomes] == [True] * 5
+    assert min(outcome.goal_m[2] for outcome in outcomes) > 0.075
