@@ -86,7 +86,7 @@ class DistillationWorlds:
         num, distance_m = worlds.num_worlds, self._config.success_distance_m
         worlds.reset(rng)
         start = worlds.object_position.copy()
-        goal = draw_goals("mixed", rng, self._config.world, distance_m, worlds.places)
+        goal = draw_goals(self._config.world.usual_goals, rng, self._config.world, distance_m, worlds.places)
         late: IntArray = np.zeros(num, dtype=np.int64)
         if self._most_late:
             late = worlds.states[:, worlds.layout["delay"]].ravel().astype(np.int64)

@@ -122,7 +122,7 @@ def run(origin: str, text: str) -> ModuleType:
     sys.modules[name] = module
     try:
         with naming_errors_of(origin):
-            exec(compile(text, origin, "exec"), vars(module))
+            exec(compile(text, origin, "exec", dont_inherit=True), vars(module))
     except BaseException:  # a second try is none of the half that ran
         del sys.modules[name]
         raise
@@ -164,6 +164,13 @@ def checked(where: str, given: Array, shape: tuple[int, ...], *, truth: bool = F
     if not np.isfinite(given).all():
         raise CodeError(f"{where} gave a number that is not finite; give finite ones")
     return given if truth else given.astype(np.float64)
+
+
+def shown(array: Array) -> Array:
+    """The same, not to be written to: what code of a user's changed in it would change what is played."""
+    seen = array.view()
+    seen.flags.writeable = False
+    return seen
 
 
 def place_of(function: object) -> tuple[str, str]:

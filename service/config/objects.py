@@ -72,6 +72,13 @@ class FixtureConfig(ObjectConfig):
     turn_rad: float = Field(0.0, description="about the vertical")
     color: Color = (0.42, 0.47, 0.54)
 
+    def placed(self, side: Literal[1, -1]) -> tuple[object, ...]:
+        """What it is and where it stands, or where its reflection in y would, to be compared; no mesh is its own."""
+        (x, y), turn_rad = self.position_m, 0.0 if self.shape in ("sphere", "cylinder") else self.turn_rad
+        half_turns = round(side * turn_rad / math.pi % 1.0, 9) % 1.0
+        same = side if self.shape == "mesh" else 1
+        return self.shape, self.size_m, round(x, 9), round(side * y, 9) + 0.0, self.bottom_m, half_turns, same
+
     @property
     def corners_m(self) -> tuple[Vector, Vector]:
         """Corners with the least and the greatest coordinates of the upright box around it, metres."""

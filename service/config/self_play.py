@@ -330,6 +330,11 @@ class SelfPlayConfig(Config):
                 "without Alice there are no goals: set generator.goal_source=uniform and "
                 "generator.replay_invalid=true, or game.alice_plays=true"
             )
+        if generator.goal_source != "alice" and not (generator.replay_fraction or generator.replay_invalid):
+            raise ValueError(
+                f"generator.goal_source = {generator.goal_source!r}, but none of its goals would be played: set "
+                "generator.replay_fraction above 0, or generator.replay_invalid=true"
+            )
         game, how = self.game, self.learner.self_imitation
         most = game.alice_valid_reward + game.alice_difficult_reward + game.alice_novelty_reward
         if how.weight and how.min_reward > most:

@@ -219,6 +219,18 @@ class WorldConfig(FrozenModel):
         return self.model_copy(update={"randomisation": RandomisationConfig()})
 
     @property
+    def usual_goals(self) -> Literal["mixed", "table"]:
+        """Random goals on which a policy is tried where nothing else is asked."""
+        return "mixed" if self.fixture == "none" else "table"
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether its reflection in y is the same world, so that what is learned on one side holds on the other."""
+        as_they_are, reflected = ({each.placed(side) for each in self.fixtures} for side in (1, -1))
+        base_y_m = 0.0 if isinstance(self.robot, str) else self.robot.base_position_m[1]
+        return self.workspace.center_y_m == 0.0 and base_y_m == 0.0 and as_they_are == reflected
+
+    @property
     def num_kept_commands(self) -> int:
         """Last commands that a world remembers: those that are seen, and those that do not count yet."""
         return max(self.observed.num_commands, (self.randomisation.delay_steps or (0, 0))[1])

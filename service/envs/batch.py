@@ -17,7 +17,7 @@ from service.envs.observations import ACTION, COMMAND_PREFIX, Layouts, Observati
 from service.envs.randomisation import KEYS, ModelBank, normal
 from service.envs.reach import reach_of
 from service.envs.robot import Robot, described
-from service.envs.sampling import Places, draw_starts, gripper_boxes
+from service.envs.sampling import Places, draw_starts, gripper_boxes, join
 from service.envs.scene import FIXTURE_PREFIX, build_layout
 from service.envs.state_layout import OBSTACLE_PREFIX, obstacle_columns, places_at, pose_columns
 
@@ -384,8 +384,14 @@ class WorldBatch:
         data = mujoco.MjData(self.model)
         mujoco.mj_setState(self.model, data, state[self.layout.physics], _PHYSICS)
         mujoco.mj_forward(self.model, data)
-        # On the highest table, things come as much nearer to the gripper.
         gripper, higher_m = gripper_boxes(self.model, data), float(self.bank.table_height_m.max())
+        if self.blocked_fraction:
+            closed = state.copy()
+            closed[self.layout["fingers"]] = self.robot.finger_values(np.zeros(1))[0]
+            mujoco.mj_setState(self.model, other := mujoco.MjData(self.model), closed[self.layout.physics], _PHYSICS)
+            mujoco.mj_forward(self.model, other)
+            gripper = join(gripper, gripper_boxes(self.model, other))
+        # On the highest table, things come as much nearer to the gripper.
         self.gripper_at_start = gripper._replace(lower=gripper.lower - np.array([0.0, 0.0, higher_m]))
         for contact in data.contact[: data.ncon]:
             names = [self.model.geom(int(geom)).name for geom in contact.geom]

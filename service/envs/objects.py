@@ -95,11 +95,12 @@ def parts_of(spec: mujoco.MjSpec, shape: ObjectConfig, name: str, mass_kg: float
 def add_things(spec: mujoco.MjSpec, config: WorldConfig) -> None:
     """Add the objects that players move, and obstacles: a game goes on when one of these falls onto the floor.
 
-    The gripper touches them, and they touch table, fixtures and each other. An obstacle's friction counts wherever it
-    lies, not the greater one of it and the table's, as without a priority.
+    The gripper touches them, and they touch table, fixtures and each other. Where there are several things, the
+    friction of each counts wherever it lies, not the greater one of it and the table's, as without a priority.
     """
-    each_other = OBJECT_BIT if config.num_objects > 1 else 0
-    touching = {"contype": OBJECT_BIT, "conaffinity": GRIPPER_BIT | each_other}
+    touching = {"contype": OBJECT_BIT, "conaffinity": GRIPPER_BIT}
+    if config.num_objects > 1:
+        touching = {"contype": OBJECT_BIT, "conaffinity": GRIPPER_BIT | OBJECT_BIT, "priority": OBSTACLE_PRIORITY}
     for name, body in zip(object_names(config), config.bodies, strict=True):
         _add_free(spec, body, name, body.mass_kg, body.friction, touching)
     touching = {

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.base.types import Array, BoolArray, StateArray
-from service.base.user_code import CodeError, checked, naming_errors_of, place_of
+from service.base.user_code import CodeError, checked, naming_errors_of, place_of, shown
 from service.config.run import SUCCESS_DISTANCE_M
 from service.envs.batch import WorldBatch
 from service.envs.observations import distances, each_object
@@ -18,19 +18,13 @@ from service.envs.sampling import (
     draw_goals,
     inside_each_other,
     inside_fixtures,
+    inside_gripper_or_table,
     inside_obstacles,
 )
 from service.envs.task import Bodies, Task, View
 
 _MAX_DRAWS = 1000
 _ALL = slice(None)
-
-
-def _shown(array: Array) -> Array:
-    """The same, not to be written to: what a user's function changed in it would change the worlds."""
-    seen = array.view()
-    seen.flags.writeable = False
-    return seen
 
 
 class Rules:
@@ -66,7 +60,7 @@ class Rules:
         fingers = worlds.robot.openings(worlds.states[:, layout["fingers"]]).sum(axis=1)
         contacts = worlds.contacts().reshape(worlds.num_worlds, -1, 2)
         parts = worlds.ee_position, fingers, contacts, each_object(goal), self.elapsed, self.memory
-        return View(Bodies(*map(_shown, objects)), *map(_shown, parts))
+        return View(Bodies(*map(shown, objects)), *map(shown, parts))
 
     def begin(self, worlds: BoolArray) -> None:
         """Begin new episodes in some worlds (N,)."""
@@ -105,9 +99,9 @@ class Rules:
             found = self._asked(name, asked.objects.place.shape, asked, rng)
             place[wrong] = found.reshape(len(found), -1)
             wrong = self.out_of_reach(place) | inside_fixtures(place, config)
-            wrong |= inside_obstacles(place, obstacles, config)
+            wrong |= inside_obstacles(place, obstacles, config) | inside_each_other(place, config)
             if name == "starts":
-                wrong |= inside_each_other(place, config, batch.gripper_at_start)
+                wrong |= inside_gripper_or_table(place, config, batch.gripper_at_start)
             if not wrong.any():
                 return place
         where = place_of(getattr(self.task, name))[1]
@@ -156,5 +150,7 @@ class Rules:
         function = getattr(self.task, name)
         origin, place = place_of(function)
         with naming_errors_of(origin):
-            found = np.asarray(function(*given))
+            answer = function(*given)
+        with naming_errors_of(place):
+            found = np.asarray(answer)
         return checked(f"{place}: {name}", found, shape, truth=truth)

@@ -101,7 +101,7 @@ def draw_starts(rng: np.random.Generator, num: int, config: WorldConfig, gripper
     """
     others = (*config.bodies[1:], *config.obstacles)
     first, box, _ = draw_objects(rng, num, config)
-    standing, beside = _join(_around_fixtures(config), gripper), np.empty((num, len(others), 3))
+    standing, beside = join(_around_fixtures(config), gripper), np.empty((num, len(others), 3))
     left = np.arange(num)
     for _ in range(_NUM_ARRANGEMENTS):
         clear = ~_overlap(_around(first[left], config.shape), gripper)
@@ -252,17 +252,25 @@ def _drawn_apart(draw: Callable[[int], StateArray], num: int, config: WorldConfi
 
 
 def are_apart(goal: StateArray, config: WorldConfig) -> BoolArray:
-    """(N,) whether objects at their places of (N, 3 K) are apart: cubes of 5 cm by 7 cm."""
-    place, least = each_object(goal), least_distances(config)
-    one, other = np.triu_indices(config.num_objects, 1)
-    apart: BoolArray = (np.linalg.norm(place[:, one] - place[:, other], axis=2) >= least[one, other]).all(axis=1)
-    return apart
+    """(N,) whether all objects at their places of (N, 3 K) are apart: see ``apart``."""
+    all_apart: BoolArray = np.all(apart(goal, config), axis=(1, 2))
+    return all_apart
 
 
-def least_distances(config: WorldConfig) -> StateArray:
-    """(K, K) least distance of two objects that lie side by side, however they are turned, metres."""
-    radius: StateArray = np.array([np.hypot(*body.extent_m[:2]) / 2 for body in config.bodies])
-    return np.add.outer(radius, radius)
+def apart(goal: StateArray, config: WorldConfig) -> BoolArray:
+    """(N, K, K) which objects at their places of (N, 3 K) are apart, however they are turned about the vertical.
+
+    Cubes of 5 cm are by 7 cm; what is tall has to be beside or above as well.
+    """
+    place, extent = each_object(goal), np.array([body.extent_m for body in config.bodies])
+    way: StateArray = np.abs(place[:, :, None] - place[:, None])
+    radius, half = np.hypot(extent[:, 0], extent[:, 1]) / 2, extent[:, 2] / 2
+    least = np.add.outer(radius, radius)
+    beside = np.hypot(way[..., 0], way[..., 1]) >= least
+    clear = beside | (way[..., 2] >= np.add.outer(half, half))
+    itself = np.eye(config.num_objects, dtype=bool)
+    found: BoolArray = itself | (clear & (np.linalg.norm(way, axis=3) >= least))
+    return found
 
 
 def sample_in_volume(
@@ -319,14 +327,13 @@ def _one_moved(
     """(N, 3 K) goals in which one object has a mixed goal clear of the others, which are to stay where they are."""
     num = len(places)
     worlds, moved = np.arange(num), rng.integers(config.num_objects, size=num)
-    goal, near, least = places.copy(), np.ones(num, dtype=bool), least_distances(config)[moved]
+    goal, near = places.copy(), np.ones(num, dtype=bool)
     place = each_object(goal)  # a view
     for _ in range(_MAX_DRAWS):
         for index, body in enumerate(config.bodies):
             here = near & (moved == index)
             place[here, index] = _goals_of(body, "mixed", rng, int(here.sum()), config, success_distance_m)
-        beside = np.linalg.norm(place - place[worlds, moved][:, None], axis=2) < least
-        near = beside.sum(axis=1) > 1  # it is beside itself
+        near = ~np.all(apart(goal, config)[worlds, moved], axis=1)
         if not near.any():
             return goal
     raise ConfigError("world.objects: no room for a goal beside the others: make world.workspace larger")
@@ -375,14 +382,20 @@ def inside_fixtures(position: StateArray, config: WorldConfig) -> BoolArray:
     return _some_object(position, config, lambda around: _overlap(_smaller(around), fixtures))
 
 
-def inside_each_other(position: StateArray, config: WorldConfig, gripper: Boxes) -> BoolArray:
-    """(N,) whether objects at their places of (N, 3 K) would be more than a millimetre inside each other or it."""
-    place = each_object(position)
+def inside_each_other(position: StateArray, config: WorldConfig) -> BoolArray:
+    """(N,) whether objects at their places of (N, 3 K) would be more than a millimetre inside each other."""
+    place, inside = each_object(position), np.zeros(len(position), dtype=bool)
     around = [_smaller(_around(place[:, index], body)) for index, body in enumerate(config.bodies)]
-    inside: BoolArray = np.any([_overlap(each, gripper) for each in around], axis=0)
     for index, each in enumerate(around[1:], start=1):
         others = Boxes(*(np.stack(corners, axis=1) for corners in zip(*around[:index], strict=True)))
         inside |= _overlap(each, others)
+    return inside
+
+
+def inside_gripper_or_table(position: StateArray, config: WorldConfig, gripper: Boxes) -> BoolArray:
+    """(N,) whether an object at its place of (N, 3 K) would be more than a millimetre inside of these."""
+    low = (each_object(position)[:, :, 2] < np.subtract(config.rest_heights_m, _TOUCHES_M)).any(axis=1)
+    inside: BoolArray = low | _some_object(position, config, lambda around: _overlap(_smaller(around), gripper))
     return inside
 
 
@@ -436,7 +449,8 @@ def _boxes_of(fixtures: Sequence[FixtureConfig]) -> Boxes:
     return Boxes(corners[:, 0], corners[:, 1])
 
 
-def _join(one: Boxes, other: Boxes) -> Boxes:
+def join(one: Boxes, other: Boxes) -> Boxes:
+    """All boxes of both."""
     return Boxes(*(np.concatenate(pair) for pair in zip(one, other, strict=True)))
 
 

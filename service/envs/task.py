@@ -138,6 +138,13 @@ class Task:
     def __post_init__(self) -> None:
         if not isinstance(self.world, Mapping):
             raise ValueError(f"task {self.title}: world = {self.world!r}: give a mapping of settings")
+        if not isinstance(self.goals, str) and not callable(self.goals):
+            raise ValueError(f"task {self.title}: goals is a {type(self.goals).__name__}: give a kind, or a function")
+        if type(self.episode_steps) is not int or type(self.memory_size) is not int:
+            raise ValueError(
+                f"task {self.title}: episode_steps = {self.episode_steps!r}, memory_size = {self.memory_size!r}: "
+                "give whole numbers"
+            )
         if self.episode_steps < 1 or self.memory_size < 0:
             raise ValueError(
                 f"task {self.title}: episode_steps = {self.episode_steps}, memory_size = {self.memory_size}: "
@@ -179,7 +186,7 @@ class Task:
         try:
             return type(world).model_validate(tree)
         except ValidationError as error:
-            raise CodeError(f"task {self.name or self.title}: world.{first_error(error)}") from None
+            raise CodeError(f"task {self.name or self.title}: world: {first_error(error)}") from None
 
     def data(self) -> dict[str, Any]:
         """What a manifest keeps of a user's task: enough to act, without its functions."""
@@ -199,6 +206,15 @@ class _NotGiven:
 
     def __getitem__(self, key: Any) -> Any:
         raise LookupError(f"{self._part} is not known here")
+
+    def __array__(self, *_: Any, **__: Any) -> Any:
+        return self[()]
+
+    def __eq__(self, other: object) -> Any:
+        return self[()]
+
+    __ne__ = __eq__
+    __hash__ = None  # type: ignore[assignment]
 
 
 def view_of_places(achieved: Array, desired: Array) -> View:

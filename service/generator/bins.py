@@ -132,7 +132,7 @@ class TaskBins:
 
     def __init__(self, config: SelfPlayConfig, layout: StateLayout) -> None:
         self.world, self._success_distance_m = config.world, config.game.success_distance_m
-        self.some_blocked = config.game.blocked_gripper_fraction > 0.0
+        self.some_blocked = config.game.blocked_gripper_fraction > 0.0 or config.world.gripper == "blocked"
         self.obstacles = obstacle_columns(layout, len(config.world.obstacles))
         """Columns of a state that hold poses of obstacles."""
         self._contacts = layout["contacts"]
@@ -164,6 +164,6 @@ class TaskBins:
         return held
 
     def blocked(self, states: StateArray) -> BoolArray:
-        """(M,) whether the gripper of (M, S) states is blocked; none is where states have no such flag."""
+        """(M,) whether the gripper of (M, S) states is blocked: of all worlds, or where the state says so."""
         blocked: BoolArray = np.any(states[:, self._gripper_blocked] > 0.0, axis=1)
-        return blocked
+        return blocked | (self.world.gripper == "blocked")

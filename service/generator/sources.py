@@ -10,13 +10,13 @@ from inspect import getfile
 
 import numpy as np
 
-from service.base.errors import ConfigError
+from service.base.errors import ConfigError, TandemError
 from service.base.types import Array, BoolArray, StateArray
-from service.base.user_code import CodeError, checked, find_class, naming_errors_of
+from service.base.user_code import CodeError, checked, find_class, naming_errors_of, shown
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
 from service.envs.observations import each_object
-from service.envs.sampling import GoalKind, sample_goals
+from service.envs.sampling import GoalKind, check_goals, sample_goals
 from service.generator.validity import in_workspace
 
 NUM_DRAWN = 1024
@@ -37,7 +37,10 @@ class Known:
     """Whether (M, 3 K) goals are in cells to which their objects were brought in a game, or beside one: (M,)."""
 
     def random(self, rng: np.random.Generator, num: int = NUM_DRAWN, kind: GoalKind = "mixed") -> StateArray:
-        """(num, 3 K) goals as those of an evaluation, metres."""
+        """(num, 3 K) goals as those of an evaluation, but ``one``, metres."""
+        check_goals(kind, self.world)
+        if kind == "one":
+            raise TandemError("goals = 'one' depend on where the objects are; choose mixed, and let the others stay")
         return sample_goals(kind, rng, num, self.world, self.success_distance_m)
 
 
@@ -83,8 +86,9 @@ class CheckedSource:
         """(M,) weights of tasks with (M, 3 K) goals and starts."""
         if not len(goal):
             return np.zeros(0)
+        asked = each_object(goal), each_object(start), learnability
         with naming_errors_of(self._origin):
-            weight = np.asarray(self._source.weights(self._known, each_object(goal), each_object(start), learnability))
+            weight = np.asarray(self._source.weights(self._known, *map(shown, asked)))
         where = f"{self._origin}: {self._name}.weights"
         weight = checked(where, weight, learnability.shape)
         if (weight < 0.0).any():

@@ -67,6 +67,7 @@ class Learner:
         self._alice = Player(*alice, config.learner.alice, self._device)
         self._bob = Player(*bob, config.learner.bob, self._device)
         self._bob_policy = bob[0]
+        self._mirrored = config.learner.bob.mirror == "random" and config.world.is_symmetric
         self._rng = np.random.Generator(np.random.PCG64(config.seed))
         self._histories = {DEMONSTRATIONS: DemonstrationHistory(config.learner.abc.num_iterations, seen.bob.size)}
         if config.learner.self_imitation.weight:
@@ -203,15 +204,16 @@ class Learner:
         config, bob = self.config.learner, self._bob
         samples = ppo.collect([rollout.bob for rollout in rollouts], bob)
         metrics = {"num_bob_samples": float(_num(samples))}
-        mirrors, helped = config.bob.mirror == "random", solved_share(rollouts) <= config.bob_help_max_success
-        if samples is not None and mirrors and helped:
-            for symmetry in (reflection(self._layouts), *self._exchanges()):
+        mirrored, helped = self._mirrored, solved_share(rollouts) <= config.bob_help_max_success
+        exchanges = self._exchanges() if config.bob.mirror == "random" else []
+        if samples is not None and helped:
+            for symmetry in [*([reflection(self._layouts)] if mirrored else []), *exchanges]:
                 samples = transform_at_random(samples, symmetry, bob, self._rng)
         shown = [each.demonstrations for each in rollouts]
-        for symmetry in self._exchanges() if mirrors else ():
+        for symmetry in exchanges:
             shown = [exchange_at_random(each, symmetry, self._rng) for each in shown]
         demonstrations = self._to_clone(DEMONSTRATIONS, shown)
-        metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + mirrors))
+        metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + mirrored))
         updated = ppo.update(
             bob, samples, demonstrations if helped else None, config.abc, self._rng, version=self.version
         )
@@ -226,8 +228,7 @@ class Learner:
         """What a history keeps, this update's among it; None if there are none or they have no weight."""
         history, config = self._histories[name], self.config.learner
         how = config.abc if name == DEMONSTRATIONS else config.self_imitation
-        mirrored = name == DEMONSTRATIONS and config.bob.mirror == "random"
-        reflection = self._layouts.bob.mirror if mirrored else None
+        reflection = self._layouts.bob.mirror if name == DEMONSTRATIONS and self._mirrored else None
         history.append(new)
         kept = history.joined()
         observation, action = (torch.from_numpy(each).to(self._device) for each in (kept.observation, kept.action))

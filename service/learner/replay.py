@@ -95,7 +95,9 @@ class ReplayBuffer:
         return {**rows, _LAST_STEP: self._last_step[:used].copy(), **counted}
 
     def load_state(self, state: Mapping[str, Array]) -> None:
-        """Continue from a buffer of the same sizes."""
-        for name, values in {**self._columns, _LAST_STEP: self._last_step}.items():
-            values[: len(state[name])] = state[name]
+        """Continue from a buffer of as many worlds, with what fits of its newest steps."""
         self.num_added, self._began = int(state["num_added"]), np.array(state["began"], dtype=np.int64)
+        num_saved = len(state[_LAST_STEP])
+        newest = np.arange(self.num_added - min(num_saved, self.num_steps), self.num_added)
+        for name, values in {**self._columns, _LAST_STEP: self._last_step}.items():
+            values[newest % self.num_steps] = state[name][newest % max(num_saved, 1)]

@@ -68,7 +68,7 @@ class Distillation(Method):
         if self._start_from is None:
             raise TandemError("distillation learns from a trained Bob: name him, --from NAME@ALIAS")
         self._take_over(self._start_from)
-        self._meet_teacher(dict(self._start_from.networks["bob/policy"]), self._start_from.world.observed)
+        self._meet_teacher(dict(self._start_from.parameters), self._start_from.world.observed)
 
     def step(self) -> Iteration:
         """Play an episode in every world, and learn from it."""

@@ -201,6 +201,7 @@ class LocalSelfPlay(SelfPlay):
         self.game.incarnation = self._incarnation
         self._pending = from_arrays(state["pending"]) if "pending" in state else None
         self._actor.rng.bit_generator.state = state["rng"]
+        self.converged = self.generator.should_stop()
 
     def _take_over(self, start: Trained) -> None:
         lines = self.learner.take_over(start.networks, layouts(start.world))

@@ -165,7 +165,11 @@ class Hindsight:
         if self.share:
             other = rng.random(size) < self.share
             seen = self._worlds.seen
-            goal = replay.column("following", replay.draw_later(places, rng))[:, seen.positions["object"]]
+            later = replay.draw_later(places, rng)
+            if "view" in rows:  # a reward of a user's sees where objects are, not where they are seen
+                goal = replay.column("view", later)[:, : 3 * seen.num_objects]
+            else:
+                goal = replay.column("following", later)[:, seen.positions["object"]]
             if seen.num_objects > 1:
                 goal = _mixed(goal, rows["goal"], rng)
             rows["goal"][other] = goal[other]

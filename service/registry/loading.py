@@ -125,7 +125,7 @@ class Trained:
     @property
     def tried_on(self) -> Task:
         """Its task, or the random goals that it is tried on."""
-        return self.task or Task("Goals", goals="mixed" if self.config.world.fixture == "none" else "table")
+        return self.task or Task("Goals", goals=self.config.world.usual_goals)
 
     @property
     def goal_kind(self) -> GoalKind:
@@ -221,13 +221,20 @@ class Trained:
         """The same on a task, without Alice.
 
         Raises:
-            TandemError: the task has more or fewer objects.
+            TandemError: the task has more or fewer objects, or lets policies see something else.
         """
-        num, known = task.world_from(self.config.world).num_objects, self.config.world.num_objects
+        world = task.world_from(self.config.world)
+        num, known = world.num_objects, self.config.world.num_objects
         if num != known:
             raise TandemError(
                 f"{self.label} was trained in a world of {known} object{'s' * (known > 1)}, and {task.title} has "
                 f"{num}: name what was trained in such a world"
+            )
+        seen, needed = (layouts(each).positions.size for each in (world, self.config.world))
+        if seen != needed:
+            raise TandemError(
+                f"{self.label} sees {needed} positions, and in the world of {task.title} there are {seen}: leave "
+                "world.observed as it is, and as many observed obstacles"
             )
         return replace(self, task=task, alice=None)
 

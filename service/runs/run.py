@@ -284,7 +284,7 @@ def flatten(state: State) -> tuple[Arrays, dict[str, Any]]:
     arrays: Arrays = {}
     values: dict[str, Any] = {}
     for name, part in state.items():
-        if isinstance(part, Mapping) and all(isinstance(each, np.ndarray) for each in part.values()):
+        if isinstance(part, Mapping) and part and all(isinstance(each, np.ndarray) for each in part.values()):
             arrays |= {f"{name}/{key}": array for key, array in part.items()}
         else:
             values[name] = part

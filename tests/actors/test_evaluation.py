@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from service.actors.evaluation import Evaluation, IdlePolicy, evaluate, wilson_interval
+from service.actors.evaluation import Evaluation, IdlePolicy, evaluate, evaluated_goals, wilson_interval
 from service.base.liveness import work_done
 from service.config import WorldConfig
 from service.envs.sampling import GOAL_KINDS, sample_goals, sample_on_table
@@ -222,3 +222,10 @@ def test_as_dict_is_json():
     tree = json.loads(json.dumps(result.as_dict()))
     assert Evaluation(**tree) == result
     assert (tree["goals"], tree["num_episodes"], tree["num_steps"]) == ("mixed", 3, 2)
+
+
+def test_goals_that_a_world_cannot_have_are_not_asked_for():
+    assert evaluated_goals(WorldConfig()) == ("table", "air", "mixed")
+    assert evaluated_goals(WorldConfig(fixture="wall")) == ("table",)
+    assert evaluated_goals(WorldConfig(workspace={"height_m": 0.06})) == ("table", "mixed")
+    assert evaluated_goals(WorldConfig(objects=("cube", "cube"))) == ("table", "air", "mixed", "one")

@@ -1,12 +1,13 @@
 """The configuration: defaults, YAML, overrides, what a run recorded before, and errors a user can act on."""
 
+import math
 from pathlib import Path
 
 import pytest
 
 from service.base.errors import ConfigError
 from service.base.parsing import parse_yaml
-from service.config import WorkspaceConfig, dump_config, load_config
+from service.config import WorkspaceConfig, WorldConfig, dump_config, load_config
 from service.config.robot import RobotConfig
 from service.config.self_play import SelfPlayConfig
 from tests.methods.trials import small_trial
@@ -223,3 +224,26 @@ def test_self_imitation_of_turns_that_no_reward_reaches_is_refused():
 def test_a_task_that_goes_on_stays_in_its_world_unless_another_is_named():
     saved, given = small_trial(world={"friction": 0.5}), small_trial(world={"friction": 0.6})
     assert (small_trial().as_in(saved), given.as_in(saved)) == (saved, given)
+
+
+@pytest.mark.parametrize(
+    ("positions", "turns", "symmetric"),
+    [
+        ([(0.0, 0.0)], [0.0], True),
+        ([(0.0, 0.0)], [0.3], False),
+        ([(0.1, 0.1), (0.1, -0.1)], [0.3, -0.3], True),
+        ([(0.1, 0.1), (0.1, -0.1)], [0.3, 0.3], False),
+        ([(0.1, 0.1), (0.1, -0.1)], [0.3, math.pi - 0.3], True),  # half a turn more is the same box
+        ([(0.1, 0.1), (0.0, -0.1)], [0.0, 0.0], False),
+    ],
+)
+def test_which_fixtures_are_their_reflection(positions, turns, symmetric):
+    box = {"shape": "box", "size_m": (0.1, 0.06, 0.04)}
+    placed = [box | {"position_m": at, "turn_rad": turn} for at, turn in zip(positions, turns, strict=True)]
+    assert WorldConfig(fixtures=placed).is_symmetric is symmetric
+
+
+def test_a_source_whose_goals_nobody_would_play_is_refused():
+    for source in ("uniform", "mine.py:Mine"):
+        words = f"generator.goal_source = '{source}', but none of its goals would be played: set"
+        assert words in message(overrides=[f"generator={{goal_source: '{source}'}}"])

@@ -232,3 +232,21 @@ def test_ours_are_files_with_nothing_but_a_task():
     assert [task.name for task in found.values()] == list(TASKS)
     assert all(not task.code and not task.is_own and task.episode_steps == 50 for task in found.values())
     assert list(PAPERS) == list(TASKS[: len(PAPERS)])
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"episode_steps": 2 / 0.04}, "episode_steps = 50.0, memory_size = 0: give whole numbers"),
+        ({"goals": np.zeros((1, 3))}, "goals is a ndarray: give a kind, or a function"),
+    ],
+)
+def test_what_is_no_task(given, words):
+    with pytest.raises(ValueError, match=words):
+        Task("Mine", **given)
+
+
+def test_an_unknown_setting_of_the_world_is_named():
+    with pytest.raises(CodeError) as error:
+        Task("Mine", world={"obstacle": []}).world_from(WORLD)
+    assert_one_line(error.value, "task Mine: world: ", "obstacle")

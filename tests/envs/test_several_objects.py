@@ -193,3 +193,27 @@ def test_objects_that_do_not_fit_on_the_table_are_refused():
     small = {"length_x_m": 0.1, "length_y_m": 0.1}
     with pytest.raises(ConfigError, match=r"world\.objects: no room in the workspace for the 3 of them"):
         WorldBatch(WorldConfig(objects=("cube", board, board, board), workspace=small), 1)
+
+
+@pytest.mark.parametrize(("friction", "way_m"), [(0.1, 0.183), (0.3, 0.061), (1.0, 0.018)])
+def test_an_object_slides_as_far_as_its_friction_says(friction, way_m):
+    """v^2 / (2 mu g) from 0.6 m/s, though the table has a friction of 1."""
+    slippery = {"shape": "box", "size_m": (0.05, 0.05, 0.05), "friction": friction}
+    with WorldBatch(WorldConfig(objects=("cube", slippery), **FAST), 1, num_threads=1) as worlds:
+        put(worlds, object=[-0.15, -0.15, 0.025], object_2=[0.0, 0.12, 0.025])
+        worlds.states[:, worlds.layout["object_2_velocity"]] = [-0.6, 0.0, 0.0]
+        worlds.restore(worlds.states.copy())
+        before = worlds.object_position.copy()
+        for _ in range(20):
+            worlds.step(np.zeros((1, 4), dtype=np.float32))
+        slid = np.linalg.norm((worlds.object_position - before)[0, 3:])
+    assert slid == pytest.approx(way_m, rel=0.15)
+
+
+def test_nothing_has_its_goal_inside_something_tall():
+    tall = WorldConfig(objects=("cube", {"shape": "box", "size_m": (0.04, 0.04, 0.2)}), **FAST)
+    goal = each_object(sample_goals("mixed", np.random.default_rng(0), 5000, tall, 0.05))
+    way = np.abs(goal[:, 0] - goal[:, 1])
+    beside = np.hypot(way[:, 0], way[:, 1]) >= 0.05 / 2**0.5 + 0.04 / 2**0.5
+    assert (beside | (way[:, 2] >= 0.125)).all()
+    assert (~beside).any()

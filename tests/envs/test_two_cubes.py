@@ -113,3 +113,26 @@ def test_places_that_are_not_clear_are_drawn_again():
         np.testing.assert_array_equal(worlds.object_position, before)
         Rules(Task("Mine"), worlds).place(rng)  # says nothing
         np.testing.assert_array_equal(worlds.object_position, before)
+
+
+@pytest.mark.parametrize("height_m", [0.0, 0.02])
+def test_objects_do_not_start_inside_the_table(height_m):
+    def starts(s, rng):
+        return s.objects.place * [1.0, 1.0, 0.0] + [0.0, 0.0, height_m]
+
+    with WorldBatch(CUBES, 3, num_threads=1) as worlds:
+        rng = np.random.default_rng(0)
+        worlds.reset(rng)
+        with pytest.raises(CodeError, match="starts gave no place that is within reach and clear"):
+            Rules(Task("Mine", starts=starts), worlds).place(rng)
+
+
+def test_goals_of_two_do_not_lie_inside_each_other():
+    def goals(s, rng):
+        return rng.uniform([-0.1, -0.1, 0.025], [0.0, 0.0, 0.2], s.objects.place.shape)
+
+    with WorldBatch(CUBES, 300, num_threads=1) as worlds:
+        rng = np.random.default_rng(0)
+        worlds.reset(rng)
+        drawn = each_object(Rules(Task("Mine", goals=goals), worlds).draw(rng))
+    assert (np.abs(drawn[:, 0] - drawn[:, 1]).max(axis=1) > 0.047).all()

@@ -235,3 +235,12 @@ def test_the_task_has_no_left_and_right():
             reflected.step(ACTION.mirror(actions))
             difference = np.abs(FULL.mirror(worlds.full(0.5)) - reflected.full(0.5))
             assert difference[:, :11].max() < tolerance
+
+
+def test_nothing_starts_inside_fingers_that_are_closed_in_some_games():
+    high = WorldConfig(object={"shape": "box", "size_m": (0.04, 0.04, 0.11)}, physics_step_s=0.005, num_substeps=8)
+    with WorldBatch(high, 1000, num_threads=1, blocked_fraction=0.5) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        before = worlds.object_position.copy()
+        worlds.step(np.zeros((1000, 4), dtype=np.float32))
+        assert np.linalg.norm(worlds.object_position - before, axis=1).max() < 0.002

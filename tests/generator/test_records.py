@@ -10,6 +10,7 @@ import pytest
 
 from service.base.types import Metrics
 from service.config import parse_config
+from service.envs.scene import build_layout
 from service.generator.bins import NUM_TASK_BINS, GoalCells, TaskBins
 from service.generator.generator import TaskGenerator
 from service.generator.records import (
@@ -327,3 +328,13 @@ def test_random_numbers_are_left_alone_where_nothing_is_left_out(
     limits = {"max_goals": max_goals, "max_starts": max_starts}
     summarize(records, starts, reached, starts["start_position"], CELLS, TASKS, **limits, rng=rng)
     assert (rng.bit_generator.state == same.bit_generator.state) is untouched
+
+
+def test_a_world_whose_gripper_is_blocked_holds_nothing():
+    config = CONFIG.model_copy(update={"world": CONFIG.world.model_copy(update={"gripper": "blocked"})})
+    tasks = TaskBins(config, build_layout(config.world))
+    states = np.ones((3, build_layout(config.world).size))  # both fingers touch
+    assert tasks.blocked(states).all()
+    assert not tasks.held(states).any()
+    goal, start = np.array([[0.0, 0.0, 0.2]]), np.array([[0.1, 0.0, 0.025]])
+    assert tasks.index(goal, start, states[:1])[0] < len(tasks)

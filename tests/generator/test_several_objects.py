@@ -28,7 +28,10 @@ from service.generator.snapshot import _one_stays
 from service.generator.validity import Verdict, classify_goal, proposed
 from service.methods.method import goal_grid
 
-CONFIG = parse_config({"world": {"objects": ["cube", "cube"]}, "generator": {"goal_source": "reached"}}, where="test")
+CONFIG = parse_config(
+    {"world": {"objects": ["cube", "cube"]}, "generator": {"goal_source": "reached", "replay_invalid": True}},
+    where="test",
+)
 WORLD = CONFIG.world
 LAYOUT = build_layout(WORLD)
 NO_ARRANGEMENT = np.zeros(3, dtype=np.int64)

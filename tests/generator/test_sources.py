@@ -72,3 +72,18 @@ def test_what_is_wrong_is_said_before_anything_is_learned(file, old, new, said):
     with pytest.raises(TandemError) as error:
         load_config(None, SETTINGS).begin("registry", None)
     assert_one_line(error.value, said)
+
+
+def test_it_cannot_change_the_goals_that_are_played(file):
+    file.write_text(CODE.replace("        assert goal.shape", "        goal += 1.0\n        assert goal.shape"))
+    with pytest.raises(TandemError) as error:
+        load_config(None, SETTINGS).begin("registry", None)
+    assert_one_line(error.value, "ValueError", "read-only")
+
+
+@pytest.mark.parametrize("kind", ["tabel", "one"])
+def test_random_goals_are_of_a_kind_that_there_is(file, kind):
+    file.write_text(CODE.replace("goal = rng.uniform", f"known.random(rng, 4, '{kind}'); goal = rng.uniform"))
+    with pytest.raises(TandemError) as error:
+        load_config(None, SETTINGS).begin("registry", None)
+    assert_one_line(error.value, f"goals = '{kind}'")

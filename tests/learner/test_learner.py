@@ -6,6 +6,7 @@ import torch
 from safetensors.numpy import load, save
 
 from service.base.errors import ConfigError
+from service.config import parse_config
 from service.envs.observations import ACTION, BOB
 from service.learner import ppo
 from service.learner.learner import Learner, _rng_from_array, _rng_to_array, paid_well, solved_share, torch_device
@@ -372,3 +373,29 @@ def test_bob_is_mirrored_alone():
     found, before = learner.weights(), plain.weights()
     assert all(np.array_equal(each, before.alice[name]) for name, each in found.alice.items())
     assert any(not np.array_equal(each, before.bob[name]) for name, each in found.bob.items())
+
+
+@pytest.mark.parametrize(
+    ("world", "mirrored"),
+    [
+        ({}, True),
+        ({"workspace": {"center_y_m": 0.05}}, False),
+        (
+            {"fixtures": [{"shape": "box", "size_m": [0.1, 0.06, 0.04], "position_m": [0.0, 0.1], "turn_rad": 0.3}]},
+            False,
+        ),
+    ],
+)
+def test_only_what_is_alike_on_both_sides_is_mirrored(world, mirrored):
+    config = parse_config(
+        make_config(bob={"mirror": "random"}).model_dump(mode="json") | {"world": world}, where="a test"
+    )
+    learner = Learner(config)
+    rollout = make_rollout(learner, 0)
+    rows = learner._to_clone("demonstrations", [rollout.demonstrations])
+    assert len(rows) == len(rollout.demonstrations.action) * (1 + mirrored)
+    plain = Learner(parse_config(make_config().model_dump(mode="json") | {"world": world}, where="a test"))
+    found, expected = (updated(each, 0)["learner/num_demonstrations"] for each in (learner, plain))
+    assert found == expected
+    same = all(np.array_equal(each, plain.weights().bob[name]) for name, each in learner.weights().bob.items())
+    assert same is not mirrored

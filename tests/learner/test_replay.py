@@ -64,3 +64,15 @@ def test_a_restored_buffer_goes_on_as_the_first(num_added):
     np.testing.assert_array_equal(later[0], later[1])
     np.testing.assert_array_equal(first.read(drawn[0])["at"], second.read(drawn[0])["at"])
     assert first.num_added == second.num_added == num_added + 1
+
+
+@pytest.mark.parametrize(("num_steps", "kept"), [(4, range(6, 10)), (20, range(3, 10))])
+def test_a_buffer_of_another_size_takes_the_newest_steps(num_steps, kept):
+    """The total of a run may change when it is resumed, and with it what is kept."""
+    first, second = filled(10, ends={(8, 0)}), ReplayBuffer(num_steps, NUM_WORLDS, {"at": 2})
+    second.load_state(first.state())
+    step, world = (each.ravel() for each in np.meshgrid(list(kept), range(NUM_WORLDS)))
+    places = Places(step, world)
+    np.testing.assert_array_equal(second.read(places)["at"], np.stack(places, axis=1))
+    later = second.draw_later(Places(np.full(99, 7), np.zeros(99, dtype=int)), np.random.default_rng(0))
+    assert set(later.step.tolist()) == {7, 8}

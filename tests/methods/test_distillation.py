@@ -22,7 +22,7 @@ from service.registry.publishing import publish_run
 from service.registry.registry import Registry
 from service.runs.train import open_run
 from service.store.run_directory import RunDirectory
-from tests.runs.runs import TREE, assert_one_line, assert_same_run, play, read_lines
+from tests.runs.runs import TREE, assert_one_line, assert_same_run, play, read_lines, tiny_config
 
 HOW = {"num_worlds": 8, "episode_steps": 6, "gradient_steps": 3, "batch_size": 16}
 
@@ -252,3 +252,13 @@ def test_without_a_teacher_and_what_goes_together(tmp_path):
         open_run(config_of({}), RunDirectory(tmp_path / "run"))
     with pytest.raises(ConfigError, match="distillation teaches primitives"):
         parse_config({"method": "distillation", "policy": {"monolithic_bob": {}}}, where="a test")
+
+
+def test_the_teacher_of_a_run_of_self_play_is_its_averaged_bob(tmp_path):
+    _, done = play(tmp_path / "played", tiny_config(total_env_steps=40))
+    assert done is not None
+    start = load(str(tmp_path / "played"))
+    assert "alice/policy" in start.networks
+    run = run_to_end(tmp_path / "taught", config_of({}, total_env_steps=60), start)
+    for name, array in start.parameters.items():
+        np.testing.assert_array_equal(run.method._teacher[name], array)

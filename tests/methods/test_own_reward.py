@@ -111,3 +111,25 @@ def test_a_method_that_there_is_not(file):
     with pytest.raises(TandemError) as error:
         load_config(None, ["method=skills", "skills.method=metrra"])
     assert_one_line(error.value, "skills.method 'metrra': choose one of lsd, diayn, dads, metra, csf, or FILE.py:CLASS")
+
+
+def test_a_network_that_leads_to_no_goal_says_so(file, tmp_path):
+    """Or whoever plays the skills finds out."""
+    file.write_text("""
+import torch
+from torch import nn
+from service.methods.intrinsic_reward import IntrinsicReward
+
+class Upwards(IntrinsicReward):
+    def make_network(self):
+        return nn.Sequential(nn.Linear(6, 8), nn.ReLU(), nn.Linear(8, 1))
+
+    def loss(self, before, after, skill):
+        return self.network(torch.cat((after, skill), dim=1)).square().mean()
+
+    def paid(self, before, after, skill):
+        return self.network(torch.cat((after, skill), dim=1))[:, 0]
+""")
+    with pytest.raises(TandemError) as error:
+        load_config(None, SMALL).begin(tmp_path / "registry", None)
+    assert_one_line(error.value, "make_network: maps 6 numbers to 1; with zero_shot = 'way' it has to map the 3 of a")

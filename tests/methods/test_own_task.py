@@ -142,3 +142,26 @@ def test_the_examples_of_the_docs_run():
         task = find_task(f"docs/examples/{name}.py")
         check_task(task, load_config(None, []).world, relabels=name == "lift_and_hold")
         assert task.memory_size == 1
+
+
+def test_a_reward_that_compares_memory_is_refused_with_hindsight(file, tmp_path):
+    """Of other goals no memory is known, and a comparison with it would be false without a word."""
+    file.write_text(CODE.replace("reward=lambda s: near(s)", "reward=lambda s: near(s) * (s.memory == 0)[:, 0]"))
+    with pytest.raises(TandemError, match="memory is not known here: hindsight asks"):
+        begun(tmp_path / "registry")
+
+
+def test_hindsight_asks_for_where_the_object_was_not_for_where_it_was_seen(file, tmp_path):
+    there = "np.linalg.norm(s.objects[:, 0].place - s.goal[:, 0], axis=1) < 0.01"
+    file.write_text(CODE.replace("reward=lambda s: near(s).astype(float)", f"reward=lambda s: ({there}).astype(float)"))
+    run = begun(tmp_path / "registry").build(tmp_path / "registry", None)
+    run.loop.play(64)
+    run.loop.replay._columns["following"] += 0.5  # where it is seen, by a camera that is off
+    run.loop.make_batch.share = 1.0
+    assert run.loop.make_batch(run.loop.replay, 200, np.random.default_rng(0)).rewards.mean() > 0.5
+
+
+def test_a_task_that_shows_policies_something_else_is_refused(file, tmp_path):
+    file.write_text(CODE.replace("memory_size=1,", "memory_size=1, world={'observed': {'num_commands': 2}},"))
+    with pytest.raises(TandemError, match="positions, and in the world of Stay near there are"):
+        begun(tmp_path / "registry")

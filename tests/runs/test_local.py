@@ -192,6 +192,8 @@ def test_a_run_that_has_converged_ends(tmp_path, monkeypatch):
     _, result = play(tmp_path, tiny_config(total_env_steps=10**9))
     assert (result.reason, result.iteration) == ("converged", 3)
     assert newest(tmp_path).step == 3
+    _, again = play(tmp_path, tiny_config(total_env_steps=10**9), resume=True)
+    assert (again.reason, again.iteration) == ("converged", 3)
 
 
 # --- exact resume ----------------------------------------------------------------------------------------------------

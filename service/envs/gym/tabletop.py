@@ -66,7 +66,7 @@ class GoalWorlds:
         self.config = config or WorldConfig()
         asked = find_task(task) if isinstance(task, str) else task
         if asked is None:
-            asked = Task("Tabletop", goals="mixed" if self.config.fixture == "none" else "table")
+            asked = Task("Tabletop", goals=self.config.usual_goals)
         self.config = asked.world_from(self.config)
         if not success_distance_m > 0.0:
             raise TandemError(f"success_distance_m = {success_distance_m}; give a distance above 0 m")

@@ -102,6 +102,12 @@ class Game:
         return tuple(mode for mode in possible if possible[mode])
 
     @property
+    def _goals_anywhere(self) -> bool:
+        """Whether goals may follow one another: a task's own, and those of a wall, belong to a start."""
+        task = self._rules.task
+        return self.world.fixture == "none" and task.starts is None and isinstance(task.goals, str)
+
+    @property
     def shows_goal(self) -> bool:
         """Whether there is a goal now."""
         return self.mode == "goals" or (self.mode == "alice" and self._turn == "bob")
@@ -121,8 +127,8 @@ class Game:
     def reset(self) -> None:
         """Begin anew: the arm at home, the object elsewhere, and the goal, too, unless it was put where it is."""
         self.worlds.reset(self._rng)
-        self._rules.place(self._rng)
         self._begin_turn("alice" if self.mode == "alice" else "bob")
+        self._rules.place(self._rng)
         self._round = 0
         if self.new_goals:
             self._draw_goal()
@@ -207,7 +213,7 @@ class Game:
         elif late and not there:  # who learns may be stuck for ever otherwise
             self._pause(f"Not there in {self._seconds()}", "reset")
         elif self.new_goals and solved and self._steps >= 1 / self.step_s:  # a goal beside the object is seen, too
-            if self.world.fixture == "none":
+            if self._goals_anywhere:
                 self._begin_turn("bob", forget=False)
                 self._draw_goal()
             else:

@@ -9,6 +9,7 @@ import torch
 from service.actors.evaluation import IdlePolicy
 from service.base.errors import TandemError
 from service.envs.observations import layouts
+from service.envs.task import Task
 from service.envs.tasks import find_task
 from service.learner.sac_networks import GaussianActor
 from service.policies.networks import export_parameters
@@ -166,3 +167,32 @@ def test_a_task_and_its_orchestrator(champion):
     game.reset()
     assert len(begun) == 2
     game.close()
+
+
+def test_a_users_goals_begin_where_episodes_do(champion):
+    """Asked wherever the cube came to, they would walk off the table."""
+    task = Task("Away", goals=lambda s, rng: np.add(s.objects.place, [0.05, 0.0, 0.0]))
+    game, ends = Game(champion.playing(task), seed=1), set()
+    for _ in range(400):
+        game.step()
+        ends.add(game.caption.partition(" after ")[0])
+        way = game.goal - game._start_position[0]
+    game.close()
+    assert "There" in ends
+    np.testing.assert_allclose(way, [0.05, 0.0, 0.0], atol=1e-9)
+
+
+def test_a_users_starts_see_the_episode_that_begins(champion):
+    seen = []
+
+    def starts(s, rng):
+        seen.append((s.elapsed.copy(), s.memory.copy()))
+        return s.objects.place
+
+    task = Task("Counted", starts=starts, remember=lambda s: s.memory + 1, memory_size=1, episode_steps=20)
+    game = Game(champion.playing(task), seed=1)
+    go(game, 5)
+    game.reset()
+    game.close()
+    assert [(elapsed.tolist(), memory.tolist()) for elapsed, memory in seen] == [([0], [[0.0]])] * len(seen)
+    assert len(seen) >= 2
