@@ -104,7 +104,7 @@ def train(
     else:
         config = load_config(begun, overrides).begin(registry, None)
     told = on_iteration or (lambda metrics: None)
-    return training.train(config, directory, Path(registry), resume=resume, publish=publish, on_iteration=told)
+    return training.train(config, directory, registry, resume=resume, publish=publish, on_iteration=told)
 
 
 def evaluate(

@@ -43,8 +43,22 @@ CHAMPION = "panda-cube@champion"
 EXIT_SIGNAL = 128
 """Plus the signal's number: 130 for SIGINT, 143 for SIGTERM."""
 
+
+def _of_this_machine(value: Path) -> Path:
+    if str(value).startswith(("http:", "https:")):
+        raise typer.BadParameter(f"{value} is a service; give the directory of a registry", param_hint="--registry")
+    return value
+
+
 RegistryOption = Annotated[
-    Path, typer.Option("--registry", envvar="TANDEM_REGISTRY", metavar="DIR", help="Directory of the registry.")
+    Path,
+    typer.Option(
+        "--registry",
+        envvar="TANDEM_REGISTRY",
+        metavar="DIR",
+        help="Directory of the registry.",
+        callback=_of_this_machine,
+    ),
 ]
 SourceOption = Annotated[
     str,

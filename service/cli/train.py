@@ -274,6 +274,8 @@ def train_and_tell(
     if done.signal is not None:
         rest = "" if done.reason == "interrupted" else ", but not evaluated, published and drawn to the end"
         raise stopped(f"saved{rest}", done.signal, hint)
+    if done.reason == "interrupted":  # a stop request: somebody wanted this end, so it is none of the failures
+        typer.echo(f"stopped on request and saved; {hint}")
     for name, value in done.metrics.items():
         is_share = "success" in name or name == "coverage"
         typer.echo(f"{name:<36} {value:.1%}" if is_share else f"{name:<36} {value:g}")

@@ -61,7 +61,7 @@ def _run_ffmpeg(frames: Iterator[Image], path: Path, fps: float, options: tuple[
     height, width = first.shape[:2]
     command = [
         _ffmpeg(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
-        "-r", f"{fps:g}", "-i", "pipe:", *options, str(path),
+        "-r", f"{fps:g}", "-i", "pipe:", *options, f"file:{path}",
     ]  # fmt: skip
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
         assert ffmpeg.stdin is not None

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from service.base.errors import TandemError
 from service.base.progress import counted
 from service.config import WorldConfig
 from service.envs.rendering.camera import DEFAULT_VIEW, View
@@ -29,6 +30,8 @@ BAR_HEIGHT = 36
 """Height of the caption over each picture, pixels."""
 MAX_FPS = 50.0
 """A faster film leaves states out; browsers show a GIF no faster."""
+_LEAST_PANE = 8
+"""Pixels of the shorter side of a picture among several."""
 _PANE_SHAPE = 4 / 3
 """Width of a picture over its height that suits a scene best."""
 GOAL_PAUSE_S, END_PAUSE_S = 0.4, 0.8
@@ -106,7 +109,11 @@ def pane_rows(num: int, width: int, height: int) -> list[list[tuple[int, int]]]:
     def unshapely(rows: list[list[tuple[int, int]]]) -> float:
         return max(abs(math.log(pane[0] / max(pane[1], 1) / _PANE_SHAPE)) for row in rows for pane in row)
 
-    return min((_rows_of(num, num_rows, width, height) for num_rows in range(1, num + 1)), key=unshapely)
+    possible = (_rows_of(num, num_rows, width, height) for num_rows in range(1, num + 1))
+    fitting = [rows for rows in possible if min(min(pane) for row in rows for pane in row) >= _LEAST_PANE]
+    if not fitting:
+        raise TandemError(f"{num} pictures do not fit into {width}x{height}: render fewer, or give a larger --size")
+    return min(fitting, key=unshapely)
 
 
 def _rows_of(num: int, num_rows: int, width: int, height: int) -> list[list[tuple[int, int]]]:

@@ -69,14 +69,18 @@ def publish_run(
     """Publish what a run has learned, and note it in the run directory: of what it publishes next, this is the parent.
 
     Returns:
-        The new version, or the newest one of that name where it has the same parameters already.
+        The new version; or the newest one of that name, or the one that this run published last, where that has the
+        same parameters already.
 
     Raises:
         StorageError: see ``Registry.publish``; or the run directory cannot be written.
     """
+    before = _published_before(directory, registry)
     version = newest_if_same(registry, config.name, parameters)
+    if version is None and before is not None and before.name == config.name:  # others may have published since
+        version = before if _has(registry, before, parameters) else None
     if version is None:
-        parent = _published_before(directory, registry)
+        parent = before
         known = directory.history
         history = known.model_dump(mode="json") if known is not None and known.events else None
         version = publish(registry, config, parameters, metrics, parent=parent, history=history)
@@ -169,12 +173,16 @@ def _described(config: Config) -> dict[str, Any]:
 
 def newest_if_same(registry: Registry, name: str, parameters: Parameters) -> Version | None:
     """The newest version, if it has these parameters: what is published again must not become another version."""
-    for version in registry.versions(name)[-1:]:
-        with contextlib.suppress(StorageError):  # a damaged version is mended by publishing again
-            manifest, _ = registry.load(str(version))
-            if manifest.blob_sha256 == sha256_of(tensors.encode(parameters)):
-                return version
-    return None
+    newest = registry.versions(name)[-1:]
+    return newest[0] if newest and _has(registry, newest[0], parameters) else None
+
+
+def _has(registry: Registry, version: Version, parameters: Parameters) -> bool:
+    """Whether a version of this registry has these parameters; a damaged one is mended by publishing again."""
+    with contextlib.suppress(StorageError):
+        manifest, _ = registry.load(str(version))
+        return manifest.blob_sha256 == sha256_of(tensors.encode(parameters))
+    return False
 
 
 def _published_before(directory: RunDirectory, registry: Registry) -> Version | None:

@@ -14,6 +14,7 @@ A publish writes the blob, then the manifest, then the aliases, each atomically:
 from __future__ import annotations
 
 import fcntl
+import os
 from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -53,8 +54,12 @@ class Registry:
         """Check that this registry may be written.
 
         Raises:
-            RegistryError: it is marked as only read, as the one that comes with tandem is.
+            RegistryError: it is marked as only read, as the one that comes with tandem is; or it cannot be written.
         """
+        there = next(path for path in (self.root.absolute(), *self.root.absolute().parents) if path.exists())
+        if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+            what = "is not writable" if there.is_dir() else "is no directory"
+            raise RegistryError(f"cannot write {self.root}: {there} {what}; name another with --registry")
         # a file: it is found through whatever path leads to the directory
         if self.is_only_read or (self.root / READ_ONLY_FILE).exists():
             raise RegistryError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from functools import lru_cache
 from typing import Annotated
 
@@ -127,12 +128,14 @@ class Shelf:
 
     def summary(self, name: str) -> PrimitiveSummary:
         """What there is of a name that has a version."""
-        origins = self._origins(name)
+        origins, aliases = self._origins(name), dict[str, tuple[Origin, int]]()
+        with suppress(RegistryError):  # a damaged one must not hide the other names; the name's own page says so
+            aliases = self._aliases(name)
         return PrimitiveSummary(
             name=name,
             num_versions=len(origins),
             newest=max(origins),
-            aliases={alias: number for alias, (_, number) in sorted(self._aliases(name).items())},
+            aliases={alias: number for alias, (_, number) in sorted(aliases.items())},
             origins=tuple(origin for origin in reversed(self.registries) if self.registries[origin].versions(name)),
         )
 
@@ -181,5 +184,4 @@ def _lineage(manifest: Manifest) -> dict[str, str | None]:
         "kind": text(spaces.get("kind")) or "primitives",
         "task": text(spaces.get("task")),
         "primitives": text(spaces.get("primitives"), manifest.config.get("primitives")),
-        "run": text((manifest.history or {}).get("run")),
     }

@@ -26,7 +26,7 @@ RUN_FILES = {
     "coverage.png": ("Where random skills move the object", "image/png"),
 }
 """Title and media type of the files of a run directory that are served; all others are not."""
-OLDER = re.compile(r"(rounds|skills)-[0-9]{8}T[0-9]{6}\.mp4")
+OLDER = re.compile(r"(rounds|skills|episodes)-[0-9]{8}T[0-9]{6}\.mp4")
 """Name of a recording that a newer one has replaced."""
 MAX_RECORDINGS = 50
 BYTES = {"schema": {"type": "string", "format": "binary"}}

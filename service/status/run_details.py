@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import shlex
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from service.base.errors import ConfigError
+from service.base.errors import ConfigError, StorageError
 from service.base.files import open_regular
 from service.base.parsing import ParseError, parse_json
 from service.config.tree import read_yaml
@@ -65,7 +66,9 @@ def log(directory: Path | None, limit: int) -> RunLog:
     if directory is None:
         return RunLog(entries=(), num_entries=0)
     entries = read_log(directory)
-    history = read_history(directory)
+    history = None
+    with suppress(StorageError):  # the run itself says so
+        history = read_history(directory)
     for event in history.events if history is not None else ():
         said = [f"{name} was {before!r} and is {now!r}" for name, (before, now) in event.changed.items()]
         said += [f"lost and left out: {text}" for text in event.damaged_records]

@@ -216,7 +216,6 @@ class VersionSummary(FrozenModel):
     aliases: tuple[str, ...] = Field((), description="that point to this version now")
     origin: Origin = Field("registry", description="the registry of this service, or what comes with tandem")
     directory: str = Field("", description="of that registry, on the machine of this service")
-    run: str | None = Field(None, description="id of the run that made it, where the manifest tells")
     problem: str | None = Field(None, description="why there is nothing else here: the manifest is damaged")
 
 

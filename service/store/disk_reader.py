@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from hashlib import sha256
 from pathlib import Path
 from threading import Lock
 
@@ -56,7 +57,10 @@ def run_id_of(directory: Path) -> str:
     """
     path = Path(os.path.realpath(directory))  # ``Path.resolve`` does not survive a loop of links
     name = f"{path.parent.name[: 127 - len(path.name[:100])]}-{path.name}" if is_study(path.parent) else path.name
-    return re.sub(r"[^A-Za-z0-9._-]", "-", name).lstrip("._-")[:128] or "run"
+    known = re.sub(r"[^A-Za-z0-9._-]", "-", name).lstrip("._-")[:128]
+    if known == name.replace(" ", "-"):
+        return known
+    return f"{known[:119] or 'run'}-{sha256(name.encode(errors='surrogateescape')).hexdigest()[:8]}"  # no other's id
 
 
 def study_of(directory: Path) -> str | None:

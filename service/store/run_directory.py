@@ -48,6 +48,7 @@ from service.base.types import FloatArray, StateArray
 from service.base.version import LEARNING_VERSION, git_commit
 from service.config import Config, dump_config, load_config
 from service.store.checkpoints import CheckpointStore
+from service.store.models import STUDY_FILE
 from service.store.run_history import (
     FIRST_VERSION,
     Event,
@@ -289,6 +290,8 @@ class RunDirectory:
     def _check_free(self) -> None:
         if self.exists:
             raise TandemError(f"{self.path} holds a run already; continue it with --resume, or name another --run-dir")
+        if (self.path / STUDY_FILE).is_file():
+            raise TandemError(f"{self.path} holds a study; name another --run-dir")
 
     def record(self, metrics: dict[str, float]) -> None:
         """Append one iteration's metrics to metrics.jsonl and TensorBoard; where a disk is full they wait in memory."""

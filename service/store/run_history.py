@@ -90,4 +90,5 @@ def read_note(path: Path, parser: Callable[[bytes], _Note]) -> _Note | None:
     try:
         return parse_with(parser, data, path)
     except ParseError:
-        raise StorageError(f"{path} is damaged; restore it from a copy, or remove it") from None
+        hint = "restore it from a copy" if path.name == FILE else "restore it from a copy, or remove it"
+        raise StorageError(f"{path} is damaged; {hint}") from None

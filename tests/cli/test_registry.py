@@ -177,3 +177,10 @@ def test_mistakes_are_one_line_and_exit_code_2(run: Run, tmp_path: Path) -> None
     (tmp_path / "manifest.json").write_text("")
     assert_user_error(run("export", "panda-cube", str(tmp_path)), "exists")
     assert run("show").exit_code == 2
+
+
+@pytest.mark.parametrize("command", [["list"], ["show", "tiny"]])
+def test_a_service_is_no_directory(command):
+    refused = CliRunner().invoke(registry_app, [*command, "--registry", "http://127.0.0.1:9"])
+    assert refused.exit_code == 2
+    assert "is a service; give the directory of a registry" in " ".join(refused.output.replace("\u2502", " ").split())

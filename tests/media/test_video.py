@@ -1,6 +1,7 @@
 """Videos of recorded rounds and episodes: their frames, captions and files."""
 
 import dataclasses
+from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
@@ -141,3 +142,18 @@ def test_a_place_that_cannot_be_written(tmp_path):
     with pytest.raises(TandemError, match="ffmpeg says"):  # odd sizes are no H.264
         encoding.encode(iter([np.zeros((31, 31, 3), dtype=np.uint8)]), tmp_path / "odd.mp4", fps=25)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_pictures_that_do_not_fit_are_told():
+    with pytest.raises(TandemError, match="64 pictures do not fit into 64x64: render fewer, or give a larger --size"):
+        pane_rows(64, 64, 64)
+    assert min(min(pane) for row in pane_rows(64, 1280, 720) for pane in row) > 0
+
+
+def test_a_film_may_have_a_colon_in_its_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a:b").mkdir()
+    states = np.tile(still(1)[:, None], (1, 1, 1))
+    episodes = RecordedEpisodes(states, None, np.zeros((len(states), 1), dtype=bool))
+    path = write_episode_video(episodes, WorldConfig(), Path("a:b/film.mp4"), SMALL)
+    assert path.stat().st_size > 0

@@ -337,3 +337,12 @@ def test_a_registry_that_is_marked_as_only_read_is_not_written(registry: Registr
             write()
     assert files_in(registry.root) == before
     assert registry.manifest("panda-cube").version == 1
+
+
+def test_a_registry_that_cannot_be_one_is_refused_before_anything_is_learned(tmp_path: Path) -> None:
+    file = tmp_path / "learn.yaml"
+    file.touch()
+    for root in (file, file / "below"):
+        with pytest.raises(RegistryError, match=r"learn.yaml is no directory; name another with --registry"):
+            Registry(root).check_writable()
+    Registry(tmp_path / "not" / "there" / "yet").check_writable()

@@ -130,3 +130,20 @@ def test_a_version_that_came_with_tandem_is_the_parent_in_any_registry(trained, 
         published = publish_run(run.directory, registry, run.config, run.method.parameters(), {})
         parents.append(registry.manifest(str(published)).parent)
     assert parents == ["tiny@1", None]
+
+
+def test_what_was_published_once_is_not_published_again_after_another_run(trained):
+    """Or who resumes a finished run takes latest back to an older policy."""
+    root, directory, version = trained
+    registry, mine = Registry(root / "registry"), load(str(version), root / "registry")
+    other, _ = play(root / "other", tiny_config(seed=1))
+    other.close()
+    later = publish_run(other.directory, registry, other.config, other.method.parameters(), {})
+    assert publish_run(directory, registry, mine.config, mine.parameters, {}) == version
+    assert registry.aliases(version.name)["latest"] == later.number
+
+
+def test_a_run_does_not_begin_in_the_directory_of_a_study(tmp_path):
+    (tmp_path / "study.json").write_text("{}")
+    with pytest.raises(TandemError, match="holds a study; name another --run-dir"):
+        play(tmp_path)

@@ -144,6 +144,9 @@ def test_damaged_files(tmp_path):
         assert_problem(client.get(f"/v1/blobs/sha256/{digest}"), 500, "damaged", digest)
         (tmp_path / "registry" / "models" / "tiny" / "aliases" / "latest").write_text("two")
         assert_problem(client.get("/v1/primitives/tiny"), 500, "failed", "latest", "damaged")
+        listed = {each["name"]: each["aliases"] for each in client.get("/v1/primitives").json()["primitives"]}
+        assert listed["tiny"] == {}
+        assert "champion" in listed["panda-cube"]
 
 
 def test_a_run_that_cannot_be_read_hides_no_other(tmp_path):

@@ -162,9 +162,14 @@ def test_the_runs_of_a_study_are_listed_with_the_others_under_its_name(tmp_path)
 
 
 def test_run_ids_of_directories(tmp_path):
-    for name, run_id in (("cube-1", "cube-1"), ("my run", "my-run"), ("..odd_", "odd_"), ("\u00e9", "run")):
+    for name, run_id in (("cube-1", "cube-1"), ("my run", "my-run")):
         assert run_id_of(tmp_path / name) == run_id
         assert a_status(run_id).run_id == run_id
+    strange = {
+        name: run_id_of(tmp_path / name) for name in ("..odd_", ".odd_", "\u00e9", "\u65e5\u672c", "\u4e2d\u56fd")
+    }
+    assert [run_id.rpartition("-")[0] for run_id in strange.values()] == ["odd_", "odd_", "run", "run", "run"]
+    assert len({a_status(run_id).run_id for run_id in strange.values()}) == len(strange)  # none has another's
     study = tmp_path / ("x" * 200)
     study.mkdir()
     (study / "study.json").touch()

@@ -8,8 +8,14 @@ const NONE = "\u2013";
 export function count(value) {
   if (!Number.isFinite(value)) return NONE;
   if (Math.abs(value) < 1e4) return Math.round(value).toLocaleString("en-US");
-  const [size, prefix] = PREFIXES.find(([limit]) => Math.abs(value) >= limit);
-  return `${trimmed((value / size).toPrecision(3))}${NBSP}${prefix}`;
+  return prefixed(value);
+}
+
+/** Three significant digits and a prefix; rounded first, so that 999,999 is "1 M" and not "1000 k". */
+function prefixed(value) {
+  const rounded = Number(value.toPrecision(3));
+  const [size, prefix] = PREFIXES.find(([limit]) => Math.abs(rounded) >= limit);
+  return `${trimmed((rounded / size).toPrecision(3))}${NBSP}${prefix}`;
 }
 
 /** 0.6193 to "61.9 %". */
@@ -41,9 +47,7 @@ export function duration(seconds) {
 /** 437716 to "438 kB". */
 export function bytes(value) {
   if (!Number.isFinite(value)) return NONE;
-  if (value < 1000) return `${value}${NBSP}B`;
-  const [size, prefix] = PREFIXES.find(([limit]) => value >= limit);
-  return `${trimmed((value / size).toPrecision(3))}${NBSP}${prefix}B`;
+  return value < 1000 ? `${value}${NBSP}B` : `${prefixed(value)}B`;
 }
 
 /** "1 run", "2 runs". */

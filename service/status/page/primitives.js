@@ -16,7 +16,14 @@ export function primitivesView(root, signal) {
   const shown = new Map();
   root.replaceChildren(el("h1", {}, "Primitives"), el("p", { class: "summary" }, "Frozen policies: those that runs have published here, and those that come with tandem. Newest first."), list);
   return every(EVERY_MS, signal, async () => {
-    const [{ primitives }, runs] = await Promise.all([get(["v1", "primitives"], [], signal), publishers(signal)]);
+    let found;
+    try {
+      found = await Promise.all([get(["v1", "primitives"], [], signal), publishers(signal)]);
+    } catch (error) {
+      if (!(error instanceof ApiError) || error.status === 0) throw error;
+      return list.replaceChildren(note(sentence(error.message)));
+    }
+    const [{ primitives }, runs] = found;
     const parts = [];
     for (const { name } of primitives) {
       if (!shown.has(name)) shown.set(name, new Versions(name, name));
@@ -127,7 +134,7 @@ function aliases(version) {
 
 /** What is known of where a version comes from and what was made with it: [text, ids of runs] each. */
 function lineageOf(reference, version, runs, users) {
-  const run = version.run ?? (version.origin === "registry" ? runs.by.get(reference) : null);
+  const run = version.origin === "registry" ? runs.by.get(reference) : null;
   const trainings = runs.trainings.get(reference);
   return [
     ...(version.kind === "primitives" ? [] : [[version.kind]]),
