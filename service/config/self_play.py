@@ -213,7 +213,8 @@ class BobPPOConfig(PPOConfig):
     mirror: Literal["none", "random"] = Field(
         "none",
         description="symmetry augmentation, since the task is the same from left and right. random: learn from each "
-        "sample or, as likely, from its reflection in y, and from both of each demonstration",
+        "sample or, as likely, from its reflection in y, and from both of each demonstration; in worlds that are not "
+        "alike on both sides there is no reflection",
     )
 
 

@@ -46,19 +46,28 @@ def setup(run: RunStatus, directory: Path | None, registry: Path) -> RunSetup:
         problem=problem,
         stop_command=shlex.join(["touch", str(path / "stop")]),
         resume_command=shlex.join(["tandem", "train", "--resume", "--run-dir", str(begun), *place, *runtime]),
-        commands=_uses(run, path, place) if config is not None and run.state not in ACTIVE else (),
+        commands=_uses(run, path, place, config) if config is not None and run.state not in ACTIVE else (),
     )
 
 
-def _uses(run: RunStatus, path: Path, place: list[str]) -> tuple[RunCommand, ...]:
-    """The commands that use what a run has learned."""
+def _uses(run: RunStatus, path: Path, place: list[str], config: dict[str, Any]) -> tuple[RunCommand, ...]:
+    """The commands that use what a run has learned, but for those that its method refuses."""
+    refused = set()
+    if "skills" in config and config["skills"].get("zero_shot") == "none":  # no skill leads to a goal
+        refused |= {"evaluate", "play"}
+    if "task" in config and config.get("primitives_digest") is None:  # what acts by itself is not published
+        refused |= {"publish"}
     words = {
         "Measure what it learned": ["evaluate", str(path)],
         "Watch it live in the browser": ["play", str(path)],
         "Make a film of it": ["render", str(path), "--out", f"{run.name}.mp4"],
         "Publish it in the registry": ["publish", str(path), "--name", run.name],
     }
-    return tuple(RunCommand(what=what, command=shlex.join(["tandem", *each, *place])) for what, each in words.items())
+    return tuple(
+        RunCommand(what=what, command=shlex.join(["tandem", *each, *place]))
+        for what, each in words.items()
+        if each[0] not in refused
+    )
 
 
 def log(directory: Path | None, limit: int) -> RunLog:

@@ -70,3 +70,19 @@ def test_a_configuration_that_cannot_be_read(tmp_path):
     assert "nested" in run_details.setup(status("cube"), tmp_path, tmp_path).problem
     assert run_details.setup(status("cube"), None, tmp_path).directory is None
     assert run_details.log(None, 5).num_entries == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "refused"),
+    [
+        ("skills: {zero_shot: none}\n", {"evaluate", "play"}),
+        ("skills: {zero_shot: way}\n", set()),
+        ("task: wall\nprimitives_digest:\n", {"publish"}),
+        ("task: wall\nprimitives_digest: abc\n", set()),
+    ],
+)
+def test_what_a_method_refuses_is_no_command(directory, tmp_path, text, refused):
+    (directory / "config.yaml").write_text(text)
+    found = run_details.setup(status("night", state="finished"), directory, tmp_path)
+    offered = {shlex.split(each.command)[1] for each in found.commands}
+    assert offered == {"evaluate", "play", "render", "publish"} - refused

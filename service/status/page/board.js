@@ -10,6 +10,8 @@ import { SPANS, usualPlace } from "./smoothing.js";
 
 const MAX_POINTS = 1000;
 const MAX_NAMES = 60;
+/** Most runs that the service takes in one question. */
+const MAX_RUNS = 200;
 const AXES = [["env_steps", "env steps"], ["iteration", "iterations"], ["wall_s", "hours of learning"]];
 const HOUR_S = 3600;
 let boards = 0;
@@ -83,7 +85,9 @@ export class Board {
     const names = [...new Set(this.shown().flatMap((panel) => panel.names))];
     const parts = [];
     for (let i = 0; i < names.length; i += MAX_NAMES) parts.push(names.slice(i, i + MAX_NAMES));
-    const answers = await Promise.all(parts.map((part) => this.ask(part)));
+    const chunks = [];
+    for (let i = 0; i < this.runs.length; i += MAX_RUNS) chunks.push(this.runs.slice(i, i + MAX_RUNS));
+    const answers = await Promise.all(parts.flatMap((part) => chunks.map((runs) => this.ask(part, runs))));
     if (asked !== this.asked) return; // something else was asked for meanwhile
     this.data = new Map();
     for (const { runs } of answers) {
@@ -99,11 +103,11 @@ export class Board {
     await this.draw();
   }
 
-  ask(names) {
+  ask(names, runs) {
     const [start, end] = this.range ?? [null, null];
     const unit = this.axis === "wall_s" ? HOUR_S : 1;
     const bounds = this.range ? [["start", start * unit], ["end", end * unit]] : [];
-    const query = [...this.runs.map((run) => ["runs", run.id]), ...names.map((name) => ["names", name])];
+    const query = [...runs.map((run) => ["runs", run.id]), ...names.map((name) => ["names", name])];
     return get(["v1", "series"], [...query, ["axis", this.axis], ["max_points", MAX_POINTS], ...bounds], this.signal);
   }
 
