@@ -223,18 +223,14 @@ class Trained:
         Raises:
             TandemError: the task has more or fewer objects, or lets policies see something else.
         """
-        world = task.world_from(self.config.world)
-        num, known = world.num_objects, self.config.world.num_objects
-        if num != known:
+        world, known = task.world_from(self.config.world), self.config.world
+        if (num := world.num_objects) != known.num_objects:
+            of = f"a world of {known.num_objects} object{'s' * (known.num_objects > 1)}"
+            raise TandemError(f"{self.label} was trained in {of}, and {task.title} has {num}: name what fits there")
+        if (there := layouts(world).positions.size) != (seen := layouts(known).positions.size):
             raise TandemError(
-                f"{self.label} was trained in a world of {known} object{'s' * (known > 1)}, and {task.title} has "
-                f"{num}: name what was trained in such a world"
-            )
-        seen, needed = (layouts(each).positions.size for each in (world, self.config.world))
-        if seen != needed:
-            raise TandemError(
-                f"{self.label} sees {needed} positions, and in the world of {task.title} there are {seen}: leave "
-                "world.observed as it is, and as many observed obstacles"
+                f"{self.label} sees {seen} positions, and in the world of {task.title} there are {there}: leave "
+                "world.observed as it is"
             )
         return replace(self, task=task, alice=None)
 
