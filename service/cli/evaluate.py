@@ -63,7 +63,8 @@ def evaluate(
     ] = None,
     episodes: Annotated[int, typer.Option(help="Number of random goals.", min=1)] = 300,
     steps: Annotated[
-        int | None, typer.Option(help="Steps an episode, 25 a second. Default: its task's, or 50.", min=1)
+        int | None,
+        typer.Option(help="Steps an episode, 25 a second. Default: its task's, or its run's evaluation_steps.", min=1),
     ] = None,
     seed: _Seed = 0,
     overrides: Annotated[
@@ -100,7 +101,7 @@ def evaluate(
         asked = None if goals is None else choose("--goals", goals, GOAL_KINDS)
         trained = load(reference, registry, primitives, run_task_code=run_task_code).on(task)
     players, on = _players(trained, method), trained.task
-    steps = steps or (50 if on is None else on.episode_steps)
+    steps = steps or trained.num_steps
     for option, value in (("--method", method), ("--out", out)):
         if value is not None and on is None:
             raise TandemError(f"{option} is for a task: name one by --task, such as --task push")

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner
 
+import service
 from service.base.errors import TandemError
 from service.base.lock import DirectoryLock
 from service.cli.evaluate import parse_goals
@@ -290,6 +291,14 @@ def test_evaluate_published_primitives_and_their_run(trained):
     assert from_run == {str(trained.run): rows["tiny@1"], "idle": rows["idle"]}
     other = json.loads(evaluate(trained, "tiny", "--goals", "table", "--json", "--seed", 1).stdout)
     assert other["idle"] != rows["idle"]
+
+
+def test_episodes_are_as_long_as_the_run_evaluated_them(trained):
+    """The same as ``service.evaluate``, which has no other length."""
+    words = ("evaluate", "tiny", "--registry", trained.registry, "--episodes", 2, "--goals", "table", "--json")
+    bob = service.load("tiny", registry=trained.registry)
+    assert bob.num_steps == bob.config.run.evaluation_steps != 50
+    assert json.loads(tandem(*words).stdout)["idle"]["num_steps"] == bob.num_steps
 
 
 def test_evaluate_in_a_world_of_another_layout_is_refused(trained):
