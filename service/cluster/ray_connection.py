@@ -68,7 +68,7 @@ def parse_status(text: str | None, token: str | None) -> StatusOptions | None:
     if text == "off":
         return None
     host, separator, port = text.rpartition(":")
-    if not separator or not host or not port.isdecimal() or int(port) > 65535:
+    if not separator or not host or not port.isdecimal() or len(port) > 5 or int(port) > 65535:
         raise WorkersError(f"--status {text!r}: expected HOST:PORT, such as 127.0.0.1:8321, or off")
     return StatusOptions(host.strip("[]"), int(port), token)
 

@@ -16,7 +16,7 @@ from service.envs.state_layout import OBSTACLE_PREFIX
 GRIPPER_BIT, OBJECT_BIT, TABLE_BIT, FLOOR_BIT = 1, 2, 4, 8
 """MuJoCo's contact types. Table and fixtures are touched by gripper and object, the object by the gripper. Obstacles
 are objects that are also touched by objects, and by the floor."""
-OBSTACLE_PRIORITY, _GRIPPER_PRIORITY = 1, 2
+THING_PRIORITY, _GRIPPER_PRIORITY = 1, 2
 """Where two touch, friction and stiffness are those of the one with more."""
 STIFF = {"solref": (0.01, 1.0), "solimp": (0.95, 0.99, 0.001, 0.5, 2.0)}
 """Contacts of objects and what they lie on. MuJoCo's default yields more the lighter the object: an arm leaning on the
@@ -100,13 +100,13 @@ def add_things(spec: mujoco.MjSpec, config: WorldConfig) -> None:
     """
     touching = {"contype": OBJECT_BIT, "conaffinity": GRIPPER_BIT}
     if config.num_objects > 1:
-        touching = {"contype": OBJECT_BIT, "conaffinity": GRIPPER_BIT | OBJECT_BIT, "priority": OBSTACLE_PRIORITY}
+        touching = {"contype": OBJECT_BIT, "conaffinity": GRIPPER_BIT | OBJECT_BIT, "priority": THING_PRIORITY}
     for name, body in zip(object_names(config), config.bodies, strict=True):
         _add_free(spec, body, name, body.mass_kg, body.friction, touching)
     touching = {
         "contype": OBJECT_BIT,
         "conaffinity": GRIPPER_BIT | OBJECT_BIT | FLOOR_BIT,
-        "priority": OBSTACLE_PRIORITY,
+        "priority": THING_PRIORITY,
     }
     for number, obstacle in enumerate(config.obstacles, start=1):
         _add_free(spec, obstacle, f"{OBSTACLE_PREFIX}{number}", obstacle.mass_kg, obstacle.friction, touching)

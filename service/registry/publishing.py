@@ -75,12 +75,12 @@ def publish_run(
     Raises:
         StorageError: see ``Registry.publish``; or the run directory cannot be written.
     """
-    before = _published_before(directory, registry)
-    version = newest_if_same(registry, config.name, parameters)
-    if version is None and before is not None and before.name == config.name:  # others may have published since
-        version = before if _has(registry, before, parameters) else None
+    version, parent = newest_if_same(registry, config.name, parameters), None
     if version is None:
-        parent = before
+        parent = _published_before(directory, registry)
+        if parent is not None and parent.name == config.name and _has(registry, parent, parameters):
+            version = parent  # others have published under this name since
+    if version is None:
         known = directory.history
         history = known.model_dump(mode="json") if known is not None and known.events else None
         version = publish(registry, config, parameters, metrics, parent=parent, history=history)

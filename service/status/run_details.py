@@ -53,7 +53,8 @@ def setup(run: RunStatus, directory: Path | None, registry: Path) -> RunSetup:
 def _uses(run: RunStatus, path: Path, place: list[str], config: dict[str, Any]) -> tuple[RunCommand, ...]:
     """The commands that use what a run has learned, but for those that its method refuses."""
     refused = set()
-    if "skills" in config and config["skills"].get("zero_shot") == "none":  # no skill leads to a goal
+    skills = config.get("skills")
+    if isinstance(skills, dict) and skills.get("zero_shot") == "none":  # no skill leads to a goal
         refused |= {"evaluate", "play"}
     if "task" in config and config.get("primitives_digest") is None:  # what acts by itself is not published
         refused |= {"publish"}

@@ -77,6 +77,7 @@ def test_a_configuration_that_cannot_be_read(tmp_path):
     [
         ("skills: {zero_shot: none}\n", {"evaluate", "play"}),
         ("skills: {zero_shot: way}\n", set()),
+        ("skills: 3\n", set()),  # written by hand
         ("task: wall\nprimitives_digest:\n", {"publish"}),
         ("task: wall\nprimitives_digest: abc\n", set()),
     ],
