@@ -20,7 +20,7 @@ from benchmarks.measuring import one_line_errors
 from benchmarks.report import comparison, figures, measured, pretraining, recipe, skills
 from benchmarks.report.downstream import draw_table, write_results
 from benchmarks.report.results import Result, read_all
-from benchmarks.reproduce import RESULTS, experiments
+from benchmarks.reproduce import MANY_UPDATES, RESULTS, experiments
 from benchmarks.run_files import Run
 from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
@@ -104,29 +104,26 @@ class Report:
         """Write all pages and pictures."""
         found = read_all(self._results, FILES)
         runs = [run for run in read_all(self._results / "runs").values() if "ablation" not in run]
-        trials, longer, recorded_skills = (
-            list(read_all(self._results / name).values()) for name in ("downstream", "downstream_longer", "skills")
-        )
+        trials, recorded_skills = (list(read_all(self._results / name).values()) for name in ("downstream", "skills"))
         for page, names in PAGES.items():  # what is wrong with a page is found before anything is drawn
             words = replace_blocks(self._docs / page, dict.fromkeys(names, ""))
             if page in ABOUT_THE_RECIPE:
                 recipe.check_words(self._docs / page, words, found["time_to_skill"])
-        seeds = read_all(self._results / "seeds")
+        seeds, why = read_all(self._results / "seeds"), read_all(self._results / "why_alice")
         coming = list(read_all(self._results / RESULTS.name / "downstream").values())
         headline = {"headline": [comparison.headline_table(trials, coming)]}
-        judged = "\n".join(
-            (
-                pretraining.seeds_words(seeds[SEEDS]),
-                time_to_skill.words(found["time_to_skill"]),
-                scaling.words(found["scaling_box"]),
-            )
+        judged = (
+            pretraining.seeds_words(seeds[SEEDS]),
+            time_to_skill.words(found["time_to_skill"]),
+            scaling.words(found["scaling_box"]),
+            pretraining.why_alice_words(why),
         )
         made = measured_blocks(found) | {
-            "results/pretraining.md": self.pretraining_blocks(runs, found, seeds),
+            "results/pretraining.md": self.pretraining_blocks(runs, found, seeds, why),
             "results/skills.md": self.skills_blocks(recorded_skills),
-            "results/comparison.md": self.comparison_blocks(trials, longer),
+            "results/comparison.md": self.comparison_blocks(trials),
             "downstream.md": headline,
-            "../README.md": headline | {"seeds": [judged]},
+            "../README.md": headline | {"seeds": ["\n".join(filter(None, judged))]},
             "own_task.md": {"learned": [measured.own_task_table(read_all(self._results / "own_task"))]},
             "scaling.md": {
                 "box": [scaling.box_block(found["scaling_box"])],
@@ -140,7 +137,7 @@ class Report:
             self.files.append(path)
         self.files += write_results(self._results, trials)
 
-    def pretraining_blocks(self, runs: Sequence[Run], found: Results, seeds: Results) -> Blocks:
+    def pretraining_blocks(self, runs: Sequence[Run], found: Results, seeds: Results, why: Results) -> Blocks:
         """Parts of the blocks about pre-training."""
         show = self.show
         counted = [run for run in runs if "curriculum" in run]  # older files have only a sample of the goals
@@ -162,7 +159,7 @@ class Report:
             "skill": [text(found["time_to_skill"]) for text in (recipe.recipe_words, time_to_skill.report)],
             "seeds": [text(seeds[SEEDS]) for text in (recipe.recipe_words, pretraining.seeds_block) if SEEDS in seeds],
             "others": [pretraining.other_seeds(name, study) for name, study in seeds.items() if name != SEEDS],
-            "why": [pretraining.why_alice_table(read_all(self._results / "why_alice"))],
+            "why": [pretraining.why_alice_table(why)],
             "champion": [pretraining.champion_words(seeds[SEEDS])],
             "tasks": [pretraining.tasks_table(runs)],
             "curves": [
@@ -185,10 +182,14 @@ class Report:
             "curves": [curves],
         }
 
-    def comparison_blocks(self, trials: Sequence[Result], longer: Sequence[Result]) -> Blocks:
+    def comparison_blocks(self, trials: Sequence[Result]) -> Blocks:
         """Parts of the blocks that compare with the paper."""
+        as_paper, longer, more_updates = (
+            list(read_all(self._results / f"downstream_{name}").values())
+            for name in ("paper", "longer", f"longer_{MANY_UPDATES}")
+        )
         blocks = {
-            "rows": [comparison.comparison_table(trials)],
+            "rows": [comparison.comparison_table(trials, as_paper)],
             "longer": [],
             "below": [comparison.distances_table(trials)],
             "harder": [comparison.harder_table(trials)],
@@ -196,7 +197,7 @@ class Report:
         }
         if longer:  # none was recorded yet
             picture = self.show("Success over more env steps", "downstream-longer", draw_table, longer)
-            blocks["longer"] = [comparison.longer_table(trials, longer), picture]
+            blocks["longer"] = [comparison.longer_table(trials, longer, more_updates), picture]
         return blocks
 
     def show(self, words: str, name: str, draw: Callable[[Any, Path], Path], recorded: Any) -> str:

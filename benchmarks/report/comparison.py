@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from benchmarks.report.downstream import BEST, PAPER, Seeds, each_seed, methods_table
 from benchmarks.report.markdown import Row, percent, table
 from benchmarks.report.results import TRIAL, Result, by_method_and_task
-from benchmarks.reproduce import Experiment
+from benchmarks.reproduce import MANY_UPDATES, PAPER_PRIMITIVES, Experiment
 from service.actors.evaluation import wilson_interval
 from service.envs.tasks import PAPERS, find_task
 from service.methods.task_evaluation import Rate, rate_of
@@ -18,39 +18,45 @@ from service.methods.task_methods import METHODS
 
 PAPER_EPISODES = 48
 """Of each of the paper's rates, most likely: nearly all are multiples of 1/48, so 16 episodes of three seeds."""
+_PAPER_RECIPE = next(iter(PAPER_PRIMITIVES.values())).partition("@")[0]
 _OWN = "ours-her"
 """The composing method of the summary."""
 _PAPER_SEEDS = 3
 """Of every rate of the paper, as its table says."""
 
 
-def comparison_table(results: Sequence[Result]) -> str:
+def comparison_table(results: Sequence[Result], as_paper: Sequence[Result] = ()) -> str:
     """Every method of the paper, every task: our mean of the seeds, and in brackets the paper's and the difference.
+
+    ``as_paper`` are trials with primitives of the recipe ``panda-cube-paper``; their methods have rows of their own.
 
     The last column has our seeds: their number on every task, or the least and the greatest of the tasks that were run.
 
     Bold where it is no accident: the paper's interval, Wilson's of 48 episodes, and ours have nothing in common.
     """
-    of = by_method_and_task(results)
-    rows: list[Row] = []
-    for method, rates in PAPER.items():
-        found = [of.get((method, task), []) for task in PAPERS]
-        cells = [_cell(seeds, rates[task]) for seeds, task in zip(found, PAPERS, strict=True)]
-        counts = sorted({len(seeds) for seeds in found if seeds})
-        rows.append((METHODS[method].title, *cells, " to ".join(map(str, counts)) or "0"))
+    of, of_paper = by_method_and_task(results), by_method_and_task(as_paper)
+    rows = [_compared(METHODS[method].title, method, of) for method in PAPER]
+    trained = [method for method in PAPER if any(name == method for name, _ in of_paper)]
+    rows += [_compared(f"{METHODS[method].title}, `{_PAPER_RECIPE}`", method, of_paper) for method in trained]
     return table(("", *(find_task(task).title for task in PAPERS), "our seeds"), rows)
 
 
-def longer_table(results: Sequence[Result], longer: Sequence[Result]) -> str:
-    """Success after the env steps of the table and after those of longer trials, where there are such."""
-    tasks = [task for task in PAPERS if any(each[TRIAL]["task"] == task for each in longer)]
-    of, of_longer = by_method_and_task(results), by_method_and_task(longer)
-    rows: list[Row] = []
-    for method in METHODS:
-        pairs = [(of.get((method, task), []), of_longer.get((method, task), [])) for task in tasks]
-        if any(after for _, after in pairs):
-            cells = [f"{_mean(before)} to {_mean(after)} ({len(after)})" if after else "" for before, after in pairs]
-            rows.append((METHODS[method].title, *cells))
+def longer_table(results: Sequence[Result], longer: Sequence[Result], more_updates: Sequence[Result] = ()) -> str:
+    """Success after the env steps of the table and after those of longer trials, where there are such.
+
+    ``more_updates`` are longer trials with ``MANY_UPDATES`` of the learner for every 64 env steps.
+    """
+    tasks = [task for task in PAPERS if any(each[TRIAL]["task"] == task for each in (*longer, *more_updates))]
+    of, rows = by_method_and_task(results), list[Row]()
+    for words, trials in (("", longer), (f", {MANY_UPDATES} updates for 64 env steps", more_updates)):
+        of_longer = by_method_and_task(trials)
+        for method in METHODS:
+            pairs = [(of.get((method, task), []), of_longer.get((method, task), [])) for task in tasks]
+            if any(after for _, after in pairs):
+                cells = [
+                    f"{_mean(before)} to {_mean(after)} ({len(after)})" if after else "" for before, after in pairs
+                ]
+                rows.append((METHODS[method].title + words, *cells))
     return table(("", *(find_task(task).title for task in tasks)), rows)
 
 
@@ -105,6 +111,18 @@ def _missing(group: Sequence[Experiment]) -> str:
         f"{'all' if len(names) == num else ', '.join(names)}: {'seeds' if ',' in numbers else 'seed'} {numbers}"
         for numbers, names in parts.items()
     )
+
+
+def _from_to(before: Seeds, after: Seeds) -> str:
+    return f"{_mean(before)} to {_mean(after)} ({len(after)})" if after else ""
+
+
+def _compared(title: str, method: str, of: Mapping[tuple[str, str], list[Result]]) -> Row:
+    """A method's row beside the paper's rates."""
+    found = [of.get((method, task), []) for task in PAPERS]
+    cells = [_cell(seeds, PAPER[method][task]) for seeds, task in zip(found, PAPERS, strict=True)]
+    counts = sorted({len(seeds) for seeds in found if seeds})
+    return title, *cells, " to ".join(map(str, counts)) or "0"
 
 
 def _mean(seeds: Seeds) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from statistics import fmean
 from typing import Any
 
 from benchmarks.record_run import ASKED, ASKED_RATES, ASKED_STEPS, TASKS
@@ -130,6 +131,25 @@ def why_alice_table(studies: Mapping[str, Mapping[str, Any]]) -> str:
         enough = sum(row["mixed"]["last"] >= asked for row in found)
         rows.append((arm.title, *(str(rate).replace("*", "\\*") for rate in rates), f"{enough} of {len(found)}"))
     return table(head, rows) if rows else ""
+
+
+def why_alice_words(studies: Mapping[str, Mapping[str, Any]]) -> str:
+    """The same of mixed goals, in a sentence for the README; nothing while an arm is not recorded.
+
+    Args:
+        studies: recorded seeds by the names of the arms.
+    """
+    if not studies.keys() >= ARMS.keys():
+        return ""
+    mean = {
+        name: percent(fmean(run["measured"][-1]["mixed"]["last"] for run in study["runs"]))
+        for name, study in studies.items()
+    }
+    return (
+        f"[Why Alice](docs/results/pretraining.md#why-alice)? With her {mean['recipe']}, with her untrained "
+        f"{mean['uniform-new-alice']}, without her {mean['uniform-alone']}, without cloning {mean['no-cloning']}, "
+        f"unpaid for his failures {mean['no-difficulty']}."
+    )
 
 
 def _evaluated(rate: float) -> dict[str, Any]:

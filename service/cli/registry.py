@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.base.errors import one_line
+from service.base.errors import StorageError, one_line
 from service.cli.common import (
     REGISTRY,
     SOURCE,
@@ -71,12 +71,13 @@ def list_versions(directory: RegistryOption = REGISTRY, as_json: JsonOption = Fa
     own, bundled = Registry(directory), Registry(BUNDLED)
     if not own.names():
         typer.echo(f"nothing published in {directory} yet", err=True)
-    rows = [
-        _summary(registry, registry.manifest(str(version)))
-        for registry in ([own] if is_bundled(own) else [own, bundled])
-        for name in registry.names()
-        for version in registry.versions(name)
-    ]
+    rows = []
+    for registry in [own] if is_bundled(own) else [own, bundled]:
+        for version in (version for name in registry.names() for version in registry.versions(name)):
+            try:
+                rows.append(_summary(registry, registry.manifest(str(version))))
+            except StorageError as error:  # a damaged one must not hide the others
+                typer.echo(f"{version}: {error}", err=True)
     if as_json:
         print_json(rows)
     elif rows:

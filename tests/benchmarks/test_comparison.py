@@ -1,6 +1,6 @@
 """What the page that compares with the paper would say of other results than those that are recorded."""
 
-from benchmarks.report.comparison import longer_table, missing_table
+from benchmarks.report.comparison import comparison_table, longer_table, missing_table
 from benchmarks.reproduce import Experiment
 
 
@@ -15,11 +15,25 @@ def test_longer_trials_by_hand():
     results = [trial("ours", "push", seed, rate) for seed, rate in enumerate((0.90, 0.92))]
     results += [trial("idle", "push", 0, 0.5), trial("ours", "box", 0, 0.5)]
     longer = [trial("ours", "push", 1, 0.97), trial("ours", "inair", 0, 1.0), trial("asp-only", "inair", 0, 0.25)]
-    lines = longer_table(results, longer).splitlines()
+    many = [trial("scratch-monolithic-her", "inair", 0, 0.75)]
+    lines = longer_table(results, longer, many).splitlines()
     assert [lines[0], *lines[2:]] == [
         "|  | InAir | Push |",
         "| ours | not run to 100.0 (1) | 91.0 to 97.0 (1) |",
         "| ASP only | not run to 25.0 (1) |  |",
+        "| scratch monolithic + HER, 32 updates for 64 env steps | not run to 75.0 (1) |  |",
+    ]
+
+
+def test_a_recipe_that_is_as_the_papers_has_rows_of_its_own():
+    tuned = [trial("ours", "push", seed, 0.9) for seed in range(3)]
+    lines = comparison_table(tuned, [trial("ours", "push", 0, 0.5)]).splitlines()
+    rows = [line for line in lines if line.startswith("| ours ") or "`" in line]
+    assert rows == [
+        "| ours | not run (83) | not run (100) | **90.0 (52, +38)** | not run (100) | not run (98) "
+        "| not run (98) | 3 |",
+        "| ours, `panda-cube-paper` | not run (83) | not run (100) | 50.0 (52, -2) | not run (100) | not run (98) "
+        "| not run (98) | 1 |",
     ]
 
 

@@ -6,7 +6,14 @@ import sys
 import pytest
 
 from benchmarks import seeds
-from benchmarks.report.pretraining import num_dips, other_seeds, seeds_block, seeds_words, why_alice_table
+from benchmarks.report.pretraining import (
+    num_dips,
+    other_seeds,
+    seeds_block,
+    seeds_words,
+    why_alice_table,
+    why_alice_words,
+)
 from benchmarks.why_alice import ARMS
 from service.runs import train
 from tests.runs.runs import TREE, write_yaml
@@ -85,12 +92,16 @@ def test_what_alice_is_for_by_hand():
     def study(*rates):
         return {"runs": [{"measured": [{kind: {"last": rate} for kind in seeds.KINDS}]} for rate in rates]}
 
-    lines = why_alice_table({"recipe": study(0.98, 0.96, 0.94), "no-cloning": study(0.5)}).splitlines()
+    some = {"recipe": study(0.98, 0.96, 0.94), "no-cloning": study(0.5)}
+    lines = why_alice_table(some).splitlines()
     # the mean, and 4.303 times 0.02 / sqrt(3) to both sides
     assert lines[2].startswith("| the recipe | 96.0 % [91, 100] (3) |")
     assert lines[2].endswith("| 2 of 3 |")
     assert lines[3].startswith("| the recipe, and Bob clones nothing | 50.0 % [47, 53]")
     assert len(lines) == 4
+    assert why_alice_words(some) == ""
+    words = why_alice_words(dict.fromkeys(ARMS, study(0.1, 0.2)) | some)
+    assert "? With her 96 %, with her untrained 15 %, without her 15 %, without cloning 50 %, " in words
 
 
 @pytest.mark.parametrize("name", ARMS)

@@ -58,6 +58,14 @@ def test_list(run: Run) -> None:
     assert {row["where"] for row in rows[2:]} == {"bundled"}
 
 
+def test_list_has_the_other_versions_beside_a_damaged_one(run: Run, registry: Registry) -> None:
+    (registry.root / "models/panda-cube/versions/1").write_text("{")
+    listed = run("list", "--json")
+    assert [row["version"] for row in json.loads(listed.stdout) if row["where"] == "yours"] == [2]
+    assert listed.stderr.startswith("panda-cube@1: ")
+    assert "damaged" in listed.stderr
+
+
 @pytest.mark.parametrize("directory", [".", "none"])
 def test_list_of_an_empty_registry_has_what_comes_with_tandem(tmp_path: Path, directory: str) -> None:
     path = tmp_path / directory

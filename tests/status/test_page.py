@@ -135,7 +135,7 @@ def test_downstream_trainings(visit, home):
 
 def test_the_goal_map(visit):
     page = visit.go("#/runs/cube").page
-    page.get_by_text("goals in 2 of 343 cells").wait_for()
+    page.get_by_text("brought to 2 of 343 cells").wait_for()
     assert page.locator(".layer").count() == 7
     tried, untried = page.locator("rect.cell").all()
     assert tried.get_attribute("fill") == "rgb(94, 201, 98)"  # 0.75 on the scale
@@ -147,7 +147,7 @@ def test_the_goal_map(visit):
     reading = page.locator(".reading")
     assert reading.inner_text() == f"x 0, y 0, z 0.02 m: Bob solves 75.0{NBSP}%, learnability 0.188, 9 tries"
     untried.hover()
-    assert reading.inner_text().endswith("m: proposed, not tried yet")
+    assert reading.inner_text().endswith("m: no goal tried here yet")
     page.get_by_label("Learnability").check()
     assert page.locator("rect.cell").first.get_attribute("fill") == "rgb(94, 201, 98)"  # 0.1875 of 0.25
     page.get_by_label("Tries").check()

@@ -17,7 +17,7 @@ export class GoalMap {
     this.low = el("span", {});
     this.high = el("span", {});
     const legend = el("p", { class: "scale" }, this.low, colourBar(), this.high);
-    const none = el("p", { class: "scale" }, el("span", { class: "key untried" }), "proposed, not tried", el("span", { class: "key unseen" }), "never proposed");
+    const none = el("p", { class: "scale" }, el("span", { class: "key untried" }), "no goal tried", el("span", { class: "key unseen" }), "never reached");
     const label = "Goal map. Arrow keys move over the cells, page up and down from layer to layer.";
     this.map = el("div", { class: "layers", tabindex: 0, role: "application", "aria-label": label });
     this.root = el("div", {}, this.summary, this.choices(), this.map, this.reading, legend, none);
@@ -43,7 +43,6 @@ export class GoalMap {
     this.map.addEventListener("pointerover", (event) => this.look(at(event) ?? null));
     this.map.addEventListener("pointerdown", (event) => this.look(at(event) ?? null));
     this.map.addEventListener("pointerleave", () => this.look(null));
-    this.map.addEventListener("blur", () => this.look(null));
     this.map.addEventListener("keydown", (event) => {
       const move = MOVES[event.key];
       if (!move || !this.grid) return;
@@ -75,8 +74,8 @@ export class GoalMap {
     this.grid = grid;
     this.layers = layers(grid);
     const mean = meanSuccess(grid.cells);
-    const solved = mean === null ? "none tried yet" : `Bob solves ${percent(mean)} in the mean over cells`;
-    setText(this.summary, `Alice proposed goals in ${grid.cells.length} of ${grid.num_cells} cells; ${solved}. From above, x to the right, y up.`);
+    const solved = mean === null ? "no goals tried yet" : `Bob solves ${percent(mean)} in the mean over cells`;
+    setText(this.summary, `The object was brought to ${grid.cells.length} of ${grid.num_cells} cells; ${solved}. From above, x to the right, y up.`);
     this.draw();
   }
 
@@ -169,7 +168,7 @@ function heights(layer) {
 /** Text about a cell. */
 function cellText(cell) {
   const where = ["x", "y", "z"].map((axis, i) => `${axis} ${quantity(Number(cell.center_m[i].toFixed(3)))}`).join(", ");
-  if (!cell.num_tries) return `${where} m: proposed, not tried yet`;
+  if (!cell.num_tries) return `${where} m: no goal tried here yet`;
   const learnability = quantity(Number(cell.learnability.toFixed(3)));
   const tries = cell.num_tries === 1 ? "1 try" : `${count(cell.num_tries)} tries`;
   return `${where} m: Bob solves ${percent(cell.success_rate)}, learnability ${learnability}, ${tries}`;
