@@ -146,9 +146,9 @@ def why_alice_words(studies: Mapping[str, Mapping[str, Any]]) -> str:
         for name, study in studies.items()
     }
     return (
-        f"[Why Alice](docs/results/pretraining.md#why-alice)? With her {mean['recipe']}, with her untrained "
-        f"{mean['uniform-new-alice']}, without her {mean['uniform-alone']}, without cloning {mean['no-cloning']}, "
-        f"unpaid for his failures {mean['no-difficulty']}."
+        f"[Why Alice](docs/results/pretraining.md#why-alice)? Of random goals Bob solves {mean['recipe']} with her, "
+        f"{mean['uniform-new-alice']} if she never learns,\n{mean['uniform-alone']} without her, {mean['no-cloning']} "
+        f"if he clones none of her turns, {mean['no-difficulty']} if she is not paid for his failures."
     )
 
 

@@ -101,7 +101,7 @@ def test_what_alice_is_for_by_hand():
     assert len(lines) == 4
     assert why_alice_words(some) == ""
     words = why_alice_words(dict.fromkeys(ARMS, study(0.1, 0.2)) | some)
-    assert "? With her 96 %, with her untrained 15 %, without her 15 %, without cloning 50 %, " in words
+    assert "solves 96 % with her, 15 % if she never learns,\n15 % without her, 50 % if he clones none" in words
 
 
 @pytest.mark.parametrize("name", ARMS)
