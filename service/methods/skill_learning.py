@@ -47,8 +47,10 @@ class SkillWorlds(TabletopWorlds):
         self.skill = self._draw()
         """(N, Z) of the episodes that go on."""
         self.finished: list[FloatArray] = []
-        """(2, 3) where the object was when an episode began and ended, metres, since this list was last cleared."""
+        """(3, 3) where the object was when an episode began, at its highest and at its end, metres, since this list was
+        last cleared."""
         self._start = self.positions[:, _OBJECT]
+        self._highest = self._start
 
     def inputs(self) -> FloatArray:
         """(N, 17 + Z) what the actor sees now."""
@@ -57,24 +59,30 @@ class SkillWorlds(TabletopWorlds):
     def step(self, actions: FloatArray) -> tuple[Columns, BoolArray]:
         """Act by (N, 4) actions; the transitions and (N,) whose episodes ended."""
         step, skill, start = self.advance(actions), self.skill, self._start
+        now = step.following[:, _OBJECT]
+        self._highest = np.where(now[:, 2:] > self._highest[:, 2:], now, self._highest)
         if step.ended.any():
             self.skill = np.where(step.ended[:, None], self._draw(), skill)
-            ends = np.stack((self._start, step.following[:, _OBJECT]), axis=1)
-            self.finished += list(ends[step.ended])
-            self._start = np.where(step.ended[:, None], self.positions[:, _OBJECT], self._start)
+            self.finished += list(np.stack((self._start, self._highest, now), axis=1)[step.ended])
+            begun = self.positions[:, _OBJECT]
+            self._start, self._highest = (
+                np.where(step.ended[:, None], begun, place) for place in (self._start, self._highest)
+            )
         seen = {name: getattr(step, name) for name in _STEP_COLUMNS}
         return {**seen, "start": start, "skill": skill, "action": actions}, step.ended
 
     def state(self) -> tuple[Arrays, Any]:
         """Copy everything that ``load_state`` needs."""
         arrays, random = super().state()
-        arrays |= {"skill": self.skill.copy(), "start": self._start.copy()}
+        arrays |= {"skill": self.skill.copy(), "start": self._start.copy(), "highest": self._highest.copy()}
         return arrays, [random, self._rng.bit_generator.state]
 
     def load_state(self, arrays: dict[str, Array], random: Any) -> None:
         """Go back to a saved state; continues bit-identically."""
         worlds = dict(arrays)
-        self.skill, self._start = (np.array(worlds.pop(name), dtype=np.float32) for name in ("skill", "start"))
+        self.skill, self._start, self._highest = (
+            np.array(worlds.pop(name), dtype=np.float32) for name in ("skill", "start", "highest")
+        )
         self._rng.bit_generator.state = random[1]
         super().load_state(worlds, random[0])
 

@@ -112,17 +112,18 @@ class SkillDiscovery(Method):
         """What the episodes that ended did to the object."""
         if not self._worlds.finished:
             return {}
-        start, end = np.stack(self._worlds.finished).astype(np.float64).swapaxes(0, 1)
+        start, highest, end = np.stack(self._worlds.finished).astype(np.float64).swapaxes(0, 1)
         self._worlds.finished.clear()
         distance = np.linalg.norm(end - start, axis=1)
         inside = in_workspace(end, self._config.world.workspace)
         moved = inside & (distance > self._config.success_distance_m)
         self._visits += self._cells.count(self._cells.index(end[moved]))
-        lifted = inside & in_air(end, self._config.world.rest_height_m)
+        lifted, raised = (in_air(place, self._config.world.rest_height_m) for place in (end, highest))
         return {
             "skills/moved_fraction": float(moved.mean()),
             "skills/outside_fraction": float((~inside).mean()),
-            "skills/lifted_fraction": float(lifted.mean()),
+            "skills/lifted_fraction": float((inside & lifted).mean()),
+            "skills/raised_fraction": float(raised.mean()),
             "skills/distance_m": float(distance[inside].mean()) if inside.any() else 0.0,
             "skills/num_cells_seen": float(np.count_nonzero(self._visits)),
         }

@@ -5,6 +5,7 @@ import pytest
 
 from service.config import parse_config
 from service.config.skills import SKILLS_OF, SkillsConfig, SkillsSACConfig
+from service.envs.observations import POSITIONS
 from service.learner.off_policy import OffPolicyLoop
 from service.learner.replay import ReplayBuffer
 from service.learner.sac import SACLearner
@@ -14,6 +15,7 @@ from service.methods.skill_learning import IntrinsicBatches, Seen, make_skill_lo
 from service.policies.frozen_skills import draw_skills
 
 NUM, LENGTH, STEP_M = 32, 10, 0.2
+OBJECT = POSITIONS["object"]
 
 
 class PointMasses:
@@ -165,6 +167,18 @@ def test_a_skill_lasts_an_episode():
     assert (skill[0] != skill[10]).all()
     assert (skill[0, 0] != skill[0, 1]).all()
     loop.worlds.close()
+
+
+def test_where_the_object_was_at_its_highest_is_told_of_each_episode():
+    _, worlds, _ = make_skill_loop(small_config())
+    rng, places = np.random.default_rng(0), [worlds.positions[:, OBJECT]]
+    while not worlds.finished:
+        rows, _ = worlds.step(rng.uniform(-1.0, 1.0, (worlds.num_worlds, 4)).astype(np.float32))
+        places.append(rows["following"][:, OBJECT])
+    way = np.stack(places, axis=1)
+    first_highest = way[np.arange(len(way)), way[..., 2].argmax(axis=1)]
+    np.testing.assert_array_equal(worlds.finished, np.stack((way[:, 0], first_highest, way[:, -1]), axis=1))
+    worlds.close()
 
 
 def test_rewards_are_scaled_and_see_the_object_alone():

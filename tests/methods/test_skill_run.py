@@ -75,18 +75,25 @@ def test_its_records(tmp_path):
         "iteration", "env_steps", "time/wall_s", "time/env_steps_per_s", "evaluation/coverage",
         "learner/critic_loss", "learner/actor_loss", "learner/entropy_coefficient", "learner/entropy",
         "learner/representation_loss",
-        "skills/moved_fraction", "skills/outside_fraction", "skills/lifted_fraction", "skills/distance_m",
-        "skills/num_cells_seen",
+        "skills/moved_fraction", "skills/outside_fraction", "skills/lifted_fraction", "skills/raised_fraction",
+        "skills/distance_m", "skills/num_cells_seen",
     }  # fmt: skip
 
 
 def test_what_the_object_did_is_counted(tmp_path):
     run = open_run(small_config(), RunDirectory(tmp_path))
-    ends = [((0, 0, 0.025), place) for place in ((0.0, 0.04, 0.025), (0.0, 0.06, 0.1), (0.0, 0.06, 0.025), (1, 0, -3))]
-    run.method._worlds.finished += [np.float32(pair) for pair in ends]
+    start, air, low = (0, 0, 0.025), (0.0, 0.06, 0.1), (0.0, 0.06, 0.07)
+    ways = [
+        (start, low, (0.0, 0.04, 0.025)),
+        (start, air, air),
+        (start, air, (0.0, 0.06, 0.025)),
+        (start, air, (1, 0, -3)),
+    ]
+    run.method._worlds.finished += [np.float32(way) for way in ways]
     found = run.method._episodes()
     assert found["skills/moved_fraction"] == 0.5  # and is still there
     assert found["skills/lifted_fraction"] == 0.25
+    assert found["skills/raised_fraction"] == 0.75
     assert found["skills/outside_fraction"] == 0.25
     assert found["skills/num_cells_seen"] == 2.0
     distance = [0.04, np.hypot(0.06, 0.075), 0.06]
