@@ -42,7 +42,7 @@ def comparison_table(results: Sequence[Result], as_paper: Sequence[Result] = ())
 
 
 def longer_table(results: Sequence[Result], longer: Sequence[Result], more_updates: Sequence[Result] = ()) -> str:
-    """Success after the env steps of the table and after those of longer trials, where there are such.
+    """Success after the env steps of the table and after those of longer trials, where there are such, of equal seeds.
 
     ``more_updates`` are longer trials with ``MANY_UPDATES`` of the learner for every 64 env steps.
     """
@@ -53,10 +53,7 @@ def longer_table(results: Sequence[Result], longer: Sequence[Result], more_updat
         for method in METHODS:
             pairs = [(of.get((method, task), []), of_longer.get((method, task), [])) for task in tasks]
             if any(after for _, after in pairs):
-                cells = [
-                    f"{_mean(before)} to {_mean(after)} ({len(after)})" if after else "" for before, after in pairs
-                ]
-                rows.append((METHODS[method].title + words, *cells))
+                rows.append((METHODS[method].title + words, *(_from_to(*pair) for pair in pairs)))
     return table(("", *(find_task(task).title for task in tasks)), rows)
 
 
@@ -114,7 +111,9 @@ def _missing(group: Sequence[Experiment]) -> str:
 
 
 def _from_to(before: Seeds, after: Seeds) -> str:
-    return f"{_mean(before)} to {_mean(after)} ({len(after)})" if after else ""
+    seeds = {each[TRIAL]["seed"] for each in after}
+    alike = [each for each in before if each[TRIAL]["seed"] in seeds]
+    return f"{_mean(alike)} to {_mean(after)} ({len(after)})" if after else ""
 
 
 def _compared(title: str, method: str, of: Mapping[tuple[str, str], list[Result]]) -> Row:

@@ -336,27 +336,32 @@ class SelfPlay:
     ) -> Demonstrations:
         """Alice's turns for the goals the current Bob failed; with hindsight, also steps of his own failures."""
         failed = records.played & ~records.solved & ~records.bob_past
-        by_alice = self._relabelled(alice, failed & ~records.replayed, records.goal)
+        hers = failed & ~records.replayed
+        by_alice = self._relabelled(alice, alice.active & hers, records.goal)
         if self._before is not None:  # of goals that span two rounds, both
-            before = self._relabelled(self._before.alice, failed & ~records.replayed & spanning, records.goal)
+            before = self._relabelled(self._before.alice, self._before.alice.active & hers & spanning, records.goal)
             by_alice = join_demonstrations([before, by_alice])
         if not self.config.learner.abc.hindsight:
             return by_alice
         config = self.config
         moved = classify_goal(records.start_position, achieved, config.world.workspace, config.game.success_distance_m)
-        by_bob = self._relabelled(bob, failed & (moved == Verdict.VALID), achieved)
+        steps = bob.active & failed & (moved == Verdict.VALID)
+        if config.world.num_objects > 1:
+            # Else most steps would show him waiting: his turns are long, and what he moves he often moves early.
+            place = bob.observation[..., self.worlds.observed.bob["object"]]
+            steps &= (distances(place, achieved) > config.game.success_distance_m).any(axis=-1)
+        by_bob = self._relabelled(bob, steps, achieved)
         # No more of his steps than of hers: he fails in several times as many, and would drown what she shows him.
         every = -(-len(by_bob.observation) // max(1, len(by_alice.observation))) or 1
         if not config.game.alice_plays:
             every = _HINDSIGHT_STRIDE
         return join_demonstrations([by_alice, Demonstrations(by_bob.observation[::every], by_bob.action[::every])])
 
-    def _relabelled(self, turns: Turns, chosen: BoolArray, goal: StateArray) -> Demonstrations:
-        """Demonstrations, with Bob's input, of how to reach (N, 3 K) goals: the turns of the ``chosen`` worlds (N,)."""
-        active = turns.active & chosen
-        goals = np.broadcast_to(goal, (*active.shape, goal.shape[1]))[active]
-        positions = turns.observation[active][:, : self.worlds.observed.positions.size]
-        return Demonstrations(bob_observation(positions, goals), turns.action[active])
+    def _relabelled(self, turns: Turns, steps: BoolArray, goal: StateArray) -> Demonstrations:
+        """Demonstrations, with Bob's input, of how to reach (N, 3 K) goals: ``steps`` (T, N) of turns."""
+        goals = np.broadcast_to(goal, (*steps.shape, goal.shape[1]))[steps]
+        positions = turns.observation[steps][:, : self.worlds.observed.positions.size]
+        return Demonstrations(bob_observation(positions, goals), turns.action[steps])
 
     def _continue_games(self, end_state: StateArray, going_on: BoolArray) -> None:
         """Begin the next round at ``end_state`` (N, S) in the worlds ``going_on`` (N,), a new game in the others."""

@@ -232,7 +232,7 @@ def each_object(rows: NDArray[Any]) -> NDArray[Any]:
 
 
 def distances(places: NDArray[Any], others: NDArray[Any]) -> NDArray[np.float64]:
-    """(N, K) distances of each object's place of (N, 3 K) from that of others."""
+    """(..., K) distances of each object's place of (..., 3 K) from that of others."""
     found: NDArray[np.float64] = np.linalg.norm(each_object(places - others), axis=-1)
     return found
 

@@ -103,7 +103,7 @@ class TaskGenerator:
             held_starts=self.held_starts.rows(),
             learnability=self.difficulty.learnability(),
             novelty=self.grid.novelty() * (1.0 - coverage),
-            novelty_of_arrangements=self.grid.novelty_of_arrangements() * (1.0 - coverage),
+            novelty_of_arrangements=self.grid.novelty_of_arrangements(),
             success_rate=np.array(self.grid.mean_success_rate()),
             coverage=np.array(coverage),
             near_reached=self.grid.near_reached(),

@@ -243,11 +243,13 @@ def summarize(
     began = _some(np.flatnonzero(begins), max_starts, rng)
     held = _some(np.flatnonzero(~begins & tasks.held(starts["start_state"])), max_starts, rng)
     valid: BoolArray = records.verdict == Verdict.VALID
-    proposed = records.proposal[valid], proposed_from[valid]
+    proposal = records.proposal[valid]
+    arrangements = tasks.arrangements(proposal, proposed_from[valid])
     cell = cells.of_moved(records.goal[as_proposed], records.start_position[as_proposed])
     return GoalSummary(
-        proposed=cells.count(cells.of_moved(*proposed)),
-        arranged=np.bincount(tasks.arrangements(*proposed), minlength=NUM_ARRANGEMENTS)[: cells.num_arrangements],
+        # She has not proposed anew where an object lies that she moved in the round before.
+        proposed=cells.count(cells.of_moved(proposal, starts["start_position"][valid])),
+        arranged=np.bincount(arrangements, minlength=NUM_ARRANGEMENTS)[: cells.num_arrangements],
         reached=reached,
         tries=cells.count(cell),
         successes=cells.count(cell[records.solved[as_proposed]]),

@@ -90,7 +90,8 @@ class GeneratorSnapshot:
     novelty: StateArray
     """(cells,) how rare proposals there are, times the share of cells in which none was ever made."""
     novelty_of_arrangements: StateArray
-    """(arrangements,) the same of arrangements of several objects; none of one."""
+    """(arrangements,) how rare they are among proposals; none of one object. Whatever cells she has seen: she stacks
+    long after she has been everywhere."""
     success_rate: StateArray
     """() mean over all cells, 0 where no goal was ever proposed."""
     coverage: StateArray
@@ -106,6 +107,8 @@ class GeneratorSnapshot:
         round_index: IntArray,
         proposal: StateArray,
         verdict: NDArray[np.int8],
+        *,
+        moved_from: StateArray,
         rng: np.random.Generator,
     ) -> GoalChoice:
         """Choose what Bob plays: Alice's valid goals, or others where the configuration says so.
@@ -121,6 +124,8 @@ class GeneratorSnapshot:
             round_index: (N,) 0 where it is the start of a game.
             proposal: (N, 3 K) positions at the end of Alice's turn, metres; those of a start of what she did not move.
             verdict: (N,) ``Verdict`` of the proposal.
+            moved_from: (N, 3 K) positions of the objects when Alice's turns began, metres. It is another one than
+                ``start_position`` where her goal leads from the start of the round before.
             rng: source of the choice.
         """
         valid: BoolArray = verdict == Verdict.VALID
@@ -131,7 +136,7 @@ class GeneratorSnapshot:
         starts = start_state.copy(), start_position.copy()
         from_reset = (round_index == 0) & ~replayed
         novelty = np.zeros(len(proposal))
-        novelty[valid] = self._novelty(proposal[valid], start_position[valid])
+        novelty[valid] = self._novelty(proposal[valid], start_position[valid], moved_from[valid])
         choice = GoalChoice(proposal.copy(), *starts, replayed, from_reset, valid | replayed, novelty)
         if tasks is not None and replayed.any():
             tasks.give(choice, np.flatnonzero(replayed), rng)
@@ -147,9 +152,9 @@ class GeneratorSnapshot:
         near: BoolArray = np.all(self.near_reached[self.cells.index(goal)], axis=1)
         return near
 
-    def _novelty(self, proposal: StateArray, start: StateArray) -> StateArray:
-        """(M,) novelty of (M, 3 K) proposals from (M, 3 K) starts."""
-        novelty: StateArray = self.novelty[self.cells.of_moved(proposal, start)]
+    def _novelty(self, proposal: StateArray, start: StateArray, moved_from: StateArray) -> StateArray:
+        """(M,) novelty of (M, 3 K) proposals from (M, 3 K) starts, which Alice's last turn led to from others."""
+        novelty: StateArray = self.novelty[self.cells.of_moved(proposal, moved_from)]
         if not self.novelty_of_arrangements.size:
             return novelty
         return np.maximum(novelty, self.novelty_of_arrangements[self.tasks.arrangements(proposal, start)])
@@ -184,21 +189,23 @@ class GeneratorSnapshot:
         config = self.config.generator
         if config.goal_source == "alice":
             rows = self.buffer
+            goal = rows["goal"]
         else:
             goal, starts = self._new_goals(rng), {"start_state": start_state, "start_position": start_position}
             if len(self.held_starts["start_position"]):
                 # Every second start is in the hand: he learns to carry long before he learns to grasp.
                 starts = join_rows([starts, _drawn(self.held_starts, len(start_state), rng)])
-            rows = {"goal": goal} | _drawn(starts, len(goal), rng)
-            if self.cells.num_objects > 1:
-                rows["goal"] = _one_stays(rows["goal"], rows["start_position"], self.config.world, rng)
-        num = len(rows["goal"])
+            rows = self._begun(goal, starts, rng)
         if config.replay_from_reset and len(self.starts["start_position"]):
-            again = {"goal": rows["goal"]} | _drawn(self.starts, num, rng)
-            if self.cells.num_objects > 1:
-                again["goal"] = _one_stays(again["goal"], again["start_position"], self.config.world, rng)
-            rows = join_rows([rows, again])
-        return _Tasks(rows, self._weight(**rows) * self._is_task(**rows), num)
+            rows = join_rows([rows, self._begun(goal, self.starts, rng)])
+        return _Tasks(rows, self._weight(**rows) * self._is_task(**rows), len(goal))
+
+    def _begun(self, goal: StateArray, starts: Rows, rng: np.random.Generator) -> Rows:
+        """Give each of (M, 3 K) goals one of the starts; of several objects often all but one are to stay."""
+        rows = {"goal": goal} | _drawn(starts, len(goal), rng)
+        if self.cells.num_objects > 1:
+            rows["goal"] = _one_stays(goal, rows["start_position"], self.config.world, rng)
+        return rows
 
     def _new_goals(self, rng: np.random.Generator) -> StateArray:
         """(M, 3 K) goals that Alice did not propose, metres."""
@@ -235,7 +242,8 @@ def _one_stays(goal: StateArray, start: StateArray, world: WorldConfig, rng: np.
     """
     num = world.num_objects
     moved = rng.integers(2 * num, size=len(goal))
-    lifted = each_object(start)[:, :, 2] > np.add(world.rest_heights_m, AIR_ABOVE_REST_M)
+    # What rests on another object does not stay, either.
+    lifted = each_object(start)[:, :, 2] > np.add(world.rest_heights_m, AIR_ABOVE_REST_M / 2)
     moved = np.where((moved < num) & lifted.any(axis=1), lifted.argmax(axis=1), moved)
     stays = (moved[:, None] < num) & (moved[:, None] != np.arange(num))
     kept = np.where(np.repeat(stays, 3, axis=1), start, goal)

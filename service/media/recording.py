@@ -232,7 +232,8 @@ def _record(
 ) -> tuple[GoalRecords, list[RecordedRound]]:
     """Play a round in every world and take each world's states and actions out of it."""
     plan = Opponents(0).plan(self_play.worlds.num_worlds, 0.0, rng)  # there are none
-    choose_goals = partial(snapshot.choose_goals, plan, rng=rng)
+    moved_from = self_play.round_starts()["start_position"]
+    choose_goals = partial(snapshot.choose_goals, plan, moved_from=moved_from, rng=rng)
     states: list[StateArray] = []
     rollout = self_play.play_round(players, plan, choose_goals, observe=lambda now: states.append(now.copy()))
     records, alice_steps = rollout.records, int(rollout.alice.active.any(axis=1).sum())

@@ -86,7 +86,8 @@ class RolloutWorker:
         self.game.block_grippers(float(snapshot.success_rate))
         starts = self.game.round_starts()
         plan = opponents.plan(self.game.worlds.num_worlds, config.past_opponent_fraction, self.rng)
-        choose_goals = partial(snapshot.choose_goals, plan, rng=self.rng)
+        moved_from = starts["start_position"]
+        choose_goals = partial(snapshot.choose_goals, plan, moved_from=moved_from, rng=self.rng)
         rollout = self.game.play_round(self._players(weights, opponents), plan, choose_goals)
         goals = summarize(
             rollout.records,

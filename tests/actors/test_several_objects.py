@@ -16,8 +16,8 @@ TWO = {"objects": ["cube", "cube"], "physics_step_s": 0.004, "num_substeps": 10}
 RED, BLUE = (-0.15, 0.1, 0.025), (0.05, -0.1, 0.025)
 
 
-def make_game(num_worlds=1, *, seed=0, places=(RED, BLUE), **game):
-    config = make_config(num_worlds, game={"bob_all_reward": 5.0, **game}, world=TWO)
+def make_game(num_worlds=1, *, seed=0, places=(RED, BLUE), settings=None, **game):
+    config = make_config(num_worlds, game={"bob_all_reward": 5.0, **game}, world=TWO, **(settings or {}))
     made = SelfPlay(config, np.random.default_rng(seed), num_threads=1)
     if places is not None:
         states, layout = made.worlds.states.copy(), made.worlds.layout
@@ -135,6 +135,21 @@ def test_a_game_goes_on_where_its_state_was_taken():
     for _ in range(2):
         one, other = (play(each, Noise(), Noise(), choose_goals=alices_own) for each in (game, later))
         assert_same_rollout(one, other)
+
+
+def test_hindsight_leaves_out_steps_after_which_nothing_moves():
+    """Red slides 11 cm in four steps, and is 11.5, 6.3 and 2.6 cm from its end in the first three."""
+    settings = {
+        "learner": {"abc": {"hindsight": True}},
+        "generator": {"goal_source": "uniform", "replay_invalid": True},
+    }
+    slides(game := make_game(8, settings=settings, alice_plays=False), "object", 1.5)
+    rollout = play(game, choose_goals=given(np.array([0.1, 0.1, 0.025, *BLUE])))
+    assert not rollout.records.solved.any()
+    found = rollout.demonstrations.observation
+    assert len(found) == 2 * 8 // 4  # one in four is shown
+    seen = game.worlds.observed.bob
+    assert (distances(found[:, seen["object"]], found[:, seen["goal"]]).max(axis=1) > 0.05).all()
 
 
 def test_demonstrations_are_exchanged_at_random():

@@ -40,7 +40,8 @@ def make_states(
 
 def make_records(proposal: Any, **overrides: Any) -> GoalRecords:
     """N valid goals of second rounds, from the origin, played as proposed by the current players and failed."""
-    proposal = np.asarray(proposal, dtype=np.float64).reshape(-1, 3)
+    proposal = np.asarray(proposal, dtype=np.float64)
+    proposal = proposal.reshape(-1, proposal.shape[-1] or 3)
     num = len(proposal)
     fields: dict[str, Any] = {
         "start_state": np.zeros((num, STATE_SIZE)),

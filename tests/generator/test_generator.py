@@ -81,7 +81,8 @@ def choose(
         np.arange(num),
         np.tile([-0.1, 0.0, 0.1], (num, 1)),
         np.array(verdict, dtype=np.int8),
-        np.random.default_rng(seed),
+        moved_from=np.tile([0.0, 0.0, 0.025], (num, 1)),
+        rng=np.random.default_rng(seed),
     )
 
 
@@ -349,7 +350,8 @@ def test_no_drawn_goal_in_the_air_where_the_gripper_is_blocked() -> None:
     state = make_states(400, SOME_BLOCKED, blocked=np.arange(400) % 2 == 0)
     index, verdict = np.zeros(400, dtype=np.int64), np.full(400, OUTSIDE, dtype=np.int8)
     place = np.tile([0.0, 0.0, 0.025], (400, 1))
-    choice = snapshot.choose_goals(all_current(400), state, place, index, place, verdict, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    choice = snapshot.choose_goals(all_current(400), state, place, index, place, verdict, moved_from=place, rng=rng)
     blocked = choice.start_state[:, BLOCKED] == 1.0
     assert 0.1 < blocked.mean() < 0.5
     assert (choice.goal[~blocked, 2] > 0.1).any()
@@ -361,9 +363,8 @@ def test_choice_does_not_alias_its_inputs() -> None:
     start_state, position = make_states(1, mark=WORLD), np.zeros((1, 3))
     verdict = np.zeros(1, dtype=np.int8)
     index = np.zeros(1, dtype=np.int64)
-    generator.snapshot().choose_goals(
-        all_current(1), start_state, position, index, position, verdict, np.random.default_rng(0)
-    )
+    given = (start_state, position, index, position, verdict)
+    generator.snapshot().choose_goals(all_current(1), *given, moved_from=position, rng=np.random.default_rng(0))
     assert start_state.tolist() == make_states(1, mark=WORLD).tolist()
     assert position.tolist() == [[0.0] * 3]
 
@@ -502,7 +503,8 @@ def play(generator: TaskGenerator, rng: np.random.Generator, iterations: range) 
         proposal = rng.uniform(lower, upper, size=(num, 3))
         verdict = rng.choice([VALID, OUTSIDE], size=num, p=[0.7, 0.3]).astype(np.int8)
         index = rng.integers(3, size=num)
-        choice = generator.snapshot().choose_goals(plan, start_state, start, index, proposal, verdict, rng)
+        given = (start_state, start, index, proposal, verdict)
+        choice = generator.snapshot().choose_goals(plan, *given, moved_from=start, rng=rng)
         records = make_records(
             proposal,
             **{name: getattr(choice, name) for name in GoalChoice.__slots__ if name != "novelty"},

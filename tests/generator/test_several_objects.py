@@ -23,10 +23,11 @@ from service.generator.bins import (
 from service.generator.difficulty import DifficultyGrid
 from service.generator.generator import TaskGenerator
 from service.generator.opponents import CURRENT, RoundPlan
-from service.generator.records import of_furthest
+from service.generator.records import of_furthest, summarize
 from service.generator.snapshot import _one_stays
 from service.generator.validity import Verdict, classify_goal, proposed
 from service.methods.method import goal_grid
+from tests.generator.outcomes import make_records
 
 CONFIG = parse_config(
     {"world": {"objects": ["cube", "cube"]}, "generator": {"goal_source": "reached", "replay_invalid": True}},
@@ -144,12 +145,13 @@ def test_goals_in_cells_that_both_have_reached_and_every_second_for_one_object(s
         states, places = worlds.states.copy(), worlds.object_position.copy()
     plan, nobody = RoundPlan(np.full(num, CURRENT), np.full(num, CURRENT)), np.zeros(num, dtype=np.int64)
     invalid = np.full(num, Verdict.NOT_MOVED, dtype=np.int8)
-    given = (plan, states, places, nobody, places, invalid, np.random.default_rng(1))
+    given = (plan, states, places, nobody, places, invalid)
     playing = parse_config(
         {"world": {"objects": ["cube", "cube"]}, "generator": {"goal_source": "reached", "replay_invalid": True}},
         where="test",
     )
-    choice = replace(snapshot, config=playing).choose_goals(*given)
+    snapshot = replace(snapshot, config=playing)
+    choice = snapshot.choose_goals(*given, moved_from=places, rng=np.random.default_rng(1))
     assert choice.played.all()
     assert choice.replayed.all()
     assert are_apart(choice.goal, WORLD).all()
@@ -159,13 +161,15 @@ def test_goals_in_cells_that_both_have_reached_and_every_second_for_one_object(s
     assert 0.3 < (num_moved == 1).mean() < 0.7
 
 
-def test_what_is_held_at_the_start_does_not_stay(snapshot):
+def test_what_is_held_or_lies_on_another_at_the_start_does_not_stay():
     held = np.tile([-0.1, 0.0, 0.15, 0.05, 0.0, 0.025], (2000, 1))
     goal = np.tile([0.0, 0.1, 0.025, -0.1, -0.1, 0.025], (2000, 1))
-    found = _one_stays(goal, held, WORLD, np.random.default_rng(0))
-    stays = np.isclose(found, held).reshape(-1, 2, 3).all(axis=2)
-    assert not stays[:, 0].any()
-    assert 0.4 < stays[:, 1].mean() < 0.6
+    on_the_other = np.tile([0.05, 0.0, 0.075, 0.05, 0.0, 0.025], (2000, 1))
+    for start in (held, on_the_other):
+        found = _one_stays(goal, start, WORLD, np.random.default_rng(0))
+        stays = np.isclose(found, start).reshape(-1, 2, 3).all(axis=2)
+        assert not stays[:, 0].any()
+        assert 0.4 < stays[:, 1].mean() < 0.6
 
 
 def test_a_goal_that_would_be_in_the_way_of_what_stays_is_as_it_was():
@@ -199,3 +203,56 @@ def test_the_map_has_one_cell_for_a_place():
     grid = goal_grid(cells, np.flatnonzero(tries), tries, rates, 1, 100)
     assert (grid.num_cells, [cell.num_tries for cell in grid.cells]) == (half, [4, 2])
     assert [cell.success_rate for cell in grid.cells] == [pytest.approx(0.4), pytest.approx(0.7)]
+
+
+def test_goals_from_the_start_of_a_game_have_nothing_of_where_other_worlds_are(snapshot):
+    settings = {"goal_source": "reached", "replay_invalid": True, "replay_from_reset": True}
+    config = parse_config({"world": {"objects": ["cube", "cube"]}, "generator": settings}, where="test")
+    now, at_reset = np.tile(START, (50, 1)), np.tile(moved((0.0, 0.1, 0.0), (0.0, 0.1, 0.0)), (50, 1))
+    states = np.zeros((50, LAYOUT.size))
+    asked = replace(snapshot, config=config, starts={"start_state": states, "start_position": at_reset})
+    tasks = asked._other_tasks(states, now, np.random.default_rng(0))
+    num = tasks.num_others
+    np.testing.assert_array_equal(tasks.rows["start_position"][num:], at_reset[:1].repeat(num, axis=0))
+    stays = [np.isclose(distances(tasks.rows["goal"], place[:1]), 0.0).any(axis=1) for place in (now, at_reset)]
+    assert num > 30
+    assert not stays[0][num:].any()
+    assert not stays[1][:num].any()
+    assert 0.3 < stays[0][:num].mean() < 0.6
+    assert 0.3 < stays[1][num:].mean() < 0.6
+
+
+RED_FIRST = moved((0.0, 0.15, 0.0))
+"""Where her last turn began, of a goal that leads from ``START``: in the round before she had moved red."""
+THEN_BLUE = moved((0.0, 0.15, 0.0), (0.0, 0.1, 0.0))
+
+
+def test_a_goal_of_two_rounds_is_as_new_as_what_she_moved_last(snapshot):
+    cells = snapshot.cells
+    blue = cells.index(THEN_BLUE[None])[0, 1]
+    rare = replace(snapshot, novelty=np.where(np.arange(len(cells)) == blue, 0.75, 0.25), novelty_of_arrangements=None)
+    for arranged, asked in (([0.0, 0.5, 0.0], 0.75), ([0.0, 1.0, 0.0], 1.0), ([1.0, 0.0, 1.0], 0.75)):
+        rare = replace(rare, novelty_of_arrangements=np.array(arranged))  # of several that moved: from the first start
+        given = (np.zeros((1, LAYOUT.size)), START[None], np.zeros(1), THEN_BLUE[None], np.array([Verdict.VALID]))
+        plan = RoundPlan(np.array([CURRENT]), np.array([CURRENT]))
+        choice = rare.choose_goals(plan, *given, moved_from=RED_FIRST[None], rng=np.random.default_rng(0))
+        assert choice.novelty.tolist() == [asked]
+
+
+def test_a_goal_of_two_rounds_counts_where_she_moved_an_object_last():
+    records = make_records(THEN_BLUE[None], start_position=START[None], start_state=np.zeros((1, LAYOUT.size)))
+    starts = {"start_state": records.start_state, "start_position": RED_FIRST[None]}
+    cells, tasks = GoalCells(WORLD, 0.05), TaskBins(CONFIG, LAYOUT)
+    nowhere, most = np.zeros(len(cells), dtype=np.int64), {"max_goals": 9, "max_starts": 9}
+    summary = summarize(records, starts, nowhere, START[None], cells, tasks, **most, rng=np.random.default_rng(0))
+    assert np.flatnonzero(summary.proposed).tolist() == [cells.index(THEN_BLUE[None])[0, 1]]
+    assert summary.arranged.tolist() == [0, 1, 0]
+
+
+def test_a_stack_is_as_rare_when_she_has_been_everywhere():
+    generator = TaskGenerator(CONFIG, LAYOUT)
+    generator.grid.seen[:] = True
+    snapshot = generator.snapshot()
+    assert snapshot.coverage == 1.0
+    assert not snapshot.novelty.any()
+    assert snapshot.novelty_of_arrangements.tolist() == [1.0, 1.0, 1.0]
