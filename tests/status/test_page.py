@@ -135,7 +135,7 @@ def test_downstream_trainings(visit, home):
 
 def test_the_goal_map(visit):
     page = visit.go("#/runs/cube").page
-    page.get_by_text("brought to 2 of 343 cells").wait_for()
+    page.get_by_text("2 of 343 cells seen").wait_for()
     assert page.locator(".layer").count() == 7
     tried, untried = page.locator("rect.cell").all()
     assert tried.get_attribute("fill") == "rgb(94, 201, 98)"  # 0.75 on the scale

@@ -17,7 +17,7 @@ export class GoalMap {
     this.low = el("span", {});
     this.high = el("span", {});
     const legend = el("p", { class: "scale" }, this.low, colourBar(), this.high);
-    const none = el("p", { class: "scale" }, el("span", { class: "key untried" }), "no goal tried", el("span", { class: "key unseen" }), "never reached");
+    const none = el("p", { class: "scale" }, el("span", { class: "key untried" }), "no goal tried", el("span", { class: "key unseen" }), "never seen");
     const label = "Goal map. Arrow keys move over the cells, page up and down from layer to layer.";
     this.map = el("div", { class: "layers", tabindex: 0, role: "application", "aria-label": label });
     this.root = el("div", {}, this.summary, this.choices(), this.map, this.reading, legend, none);
@@ -75,7 +75,7 @@ export class GoalMap {
     this.layers = layers(grid);
     const mean = meanSuccess(grid.cells);
     const solved = mean === null ? "no goals tried yet" : `Bob solves ${percent(mean)} in the mean over cells`;
-    setText(this.summary, `The object was brought to ${grid.cells.length} of ${grid.num_cells} cells; ${solved}. From above, x to the right, y up.`);
+    setText(this.summary, `${grid.cells.length} of ${grid.num_cells} cells seen; ${solved}. From above, x to the right, y up.`);
     this.draw();
   }
 
