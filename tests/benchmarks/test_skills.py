@@ -30,8 +30,10 @@ def test_a_skill_run_is_recorded(tmp_path):
     assert (run["name"], run["method"], run["config"]["seed"]) == ("dads-0", "dads", 0)
     assert run["series"]["env_steps"][-1] == 400
     assert {name.partition("/")[0] for name in run["series"]} == {
-        "iteration", "env_steps", "time", "evaluation", "skills"
+        "iteration", "env_steps", "time", "evaluation", "skills", "learner"
     }  # fmt: skip
+    kept = {"learner/entropy", "learner/entropy_coefficient"}
+    assert {name for name in run["series"] if name.startswith("learner/")} == kept
     found = run["coverage"]["stages"]
     assert {name: stage.get("env_steps") for name, stage in found.items()} == {
         "random policy": None, "beginning": 0, "middle": 200, "end": 400
