@@ -61,8 +61,11 @@ class Settings:
     """The same for Wall."""
     registry: str = "registry"
     num_goals: int = 300
+    """Of each seed."""
     num_steps: int = 50
     seed: int = 0
+    num_seeds: int = 1
+    """Seeds of goals, from ``seed`` on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +156,7 @@ def play_chunk(row: Row, chunk: int, settings: Settings, gain: Gain) -> list[Pla
     policy = policy_of(row, settings)
     starts, goals = draw_episodes(policy, settings)
     mine = slice(chunk * CHUNK, (chunk + 1) * CHUNK)
-    backend = connect(_backend(row), policy.world, seed=settings.seed + chunk)
+    backend = connect(_backend(row), policy.world, seed=1_000 * settings.seed + chunk)
     try:
         assert backend.simulator is not None
         played = []
@@ -263,14 +266,19 @@ def benchmark(settings: Settings) -> dict[str, Any]:
     """Everything measured, for JSON."""
     names = [name for name, row in ROWS.items() if getattr(settings, row.policy)]
     policy = for_robot(load(settings.policy, settings.registry))
+    seeds = [replace(settings, seed=settings.seed + index) for index in range(settings.num_seeds)]
     rows: dict[str, Any] = {}
     for name in names:
         begun, row = time.perf_counter(), ROWS[name]
         calibration = calibrate_row(row, settings)
         chunks = range(-(-settings.num_goals // CHUNK))
-        played = [each for chunk in chunks for each in play_chunk(row, chunk, settings, calibration.gain)]
+        of_seeds = [
+            [each for chunk in chunks for each in play_chunk(row, chunk, of_seed, calibration.gain)]
+            for of_seed in seeds
+        ]
         rows[name] = {
-            **summarise(played),
+            **summarise([each for played in of_seeds for each in played]),
+            "success_last_each": [summarise(played)["success_last"] for played in of_seeds],
             **{"title": row.title, "asked": row.asked, "policy": getattr(settings, row.policy)},
             **{"calibration": calibration.model_dump(mode="json"), "gain": list(calibration.gain)},
             "wall_s": round(time.perf_counter() - begun, 1),
@@ -280,7 +288,7 @@ def benchmark(settings: Settings) -> dict[str, Any]:
         policy.policy,
         policy.world,
         "mixed",
-        num_episodes=settings.num_goals,
+        num_episodes=settings.num_goals * settings.num_seeds,
         num_steps=settings.num_steps,
         success_distance_m=policy.success_distance_m,
         seed=settings.seed,
@@ -303,6 +311,8 @@ def transfer_table(result: Mapping[str, Any]) -> str:
             continue
         each = result["rows"][name]
         last = f"{percent(each['success_last'], 1)} {_interval(each, 'last')}"
+        if len(of_seeds := each.get("success_last_each", ())) > 1:
+            last += ": " + ", ".join(percent(share, 1) for share in of_seeds)
         reached = "yes" if each["success_last"] >= row.asked else "no"
         covered = ", ".join(percent(share) for share in each["calibration"]["covered_share"])
         rows.append((row.title, last, percent(each["success_ever"], 1), covered, percent(row.asked), reached))
@@ -314,10 +324,12 @@ def transfer_words(result: Mapping[str, Any]) -> str:
     """What was played, the motion of the tip, the stops, and where it was measured."""
     rows, safety = result["rows"], result["bridge"]["safety"]
     num_goals = sorted({row["num_goals"] for row in rows.values()})
+    num_seeds = result["settings"].get("num_seeds", 1)
+    seeds = "" if num_seeds == 1 else f" of {num_seeds} seeds of goals, each of which has its share after the interval"
     words = [
-        f"{result['policy']['label']}, {', '.join(map(str, num_goals))} goals a row, {result['settings']['num_steps']} "
-        "steps; 95 % Wilson intervals. In the nominal world of training and without the bridge it reaches "
-        f"{percent(result['nominal_world']['success_last'], 1)} of such goals."
+        f"{result['policy']['label']}, {', '.join(map(str, num_goals))} goals a row{seeds}, "
+        f"{result['settings']['num_steps']} steps; 95 % Wilson intervals. In the nominal world of training and without "
+        f"the bridge it reaches {percent(result['nominal_world']['success_last'], 1)} of such goals."
     ]
     if LIMITED in rows:
         each = rows[LIMITED]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from benchmarks import transfer
 from benchmarks.transfer import (
     ROWS,
     Played,
@@ -70,3 +71,13 @@ def test_a_chunk_is_played_alike_again_in_the_real_engine():
     assert [each.num_steps for each in first] == [8, 8]
     assert play_chunk(*asked) == first
     assert all(0 < each.free[0] <= 8 for each in first)  # it comes from above
+
+
+def test_each_seed_of_goals_has_its_share_in_the_table(monkeypatch):
+    pytest.importorskip("pybullet", reason="needs PyBullet: pip install 'tandem-skills[pybullet]'")
+    monkeypatch.setattr(transfer, "ROWS", {"nominal": ROWS["nominal"]})
+    found = transfer.benchmark(Settings(num_goals=3, num_steps=2, num_seeds=2))["rows"]["nominal"]
+    assert (found["num_goals"], len(found["success_last_each"])) == (6, 2)
+    shares = {"success_last": 0.5, "success_last_low": 0.2, "success_last_high": 0.8, "success_ever": 0.5}
+    shown = transfer.transfer_table({"rows": {"nominal": found | shares | {"success_last_each": [1 / 3, 2 / 3]}}})
+    assert "| 50.0 % (20 % to 80 %): 33.3 %, 66.7 % | 50.0 % |" in shown
