@@ -39,12 +39,17 @@ def test_it_starts_as_our_worlds_do_in_our_frame(robot):
     np.testing.assert_allclose(state.effector_m, [workspace.center_x_m, workspace.center_y_m, 0.08], atol=1e-3)
     np.testing.assert_allclose(state.fingers_m, [0.04, 0.04], atol=1e-4)
     np.testing.assert_allclose(ExactPoses(robot, robot).read().position_m, PLACE, atol=1e-6)
-    # The fingertips' own links: the left finger is on the side of negative y, and the gripper points down.
-    assert robot._link(9)[0][1] < -0.03 < 0.03 < robot._link(10)[0][1]
-    np.testing.assert_allclose(robot._link(8)[1], np.diag([1.0, -1.0, -1.0]), atol=5e-3)
+    # Places and orientations of the links' own frames, in the world's: the base, the hand, both fingers, the grasp target.
+    base, hand, left, right, grasp = (
+        robot._bullet.getLinkState(robot._robot, link, computeForwardKinematics=True)[4:6] for link in (0, 8, 9, 10, 11)
+    )
+    # The left finger is on the side of negative y, and the gripper points down.
+    assert left[0][1] < -0.03 < 0.03 < right[0][1]
+    down = np.reshape(robot._bullet.getMatrixFromQuaternion(hand[1]), (3, 3))
+    np.testing.assert_allclose(down, np.diag([1.0, -1.0, -1.0]), atol=5e-3)
     # The base is 0.6 m behind the origin, and the tip is 1.6 mm above the URDF's own grasp target.
-    assert robot._bullet.getLinkState(robot._robot, 0)[4][0] == pytest.approx(-0.6, abs=1e-6)
-    assert state.effector_m[2] - robot._link(11)[0][2] == pytest.approx(0.0016, abs=1e-5)
+    assert base[0][0] == pytest.approx(-0.6, abs=1e-6)
+    assert state.effector_m[2] - grasp[0][2] == pytest.approx(0.0016, abs=1e-5)
 
 
 def test_it_goes_where_it_is_sent_in_metres_and_seconds(robot):
