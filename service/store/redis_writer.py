@@ -8,7 +8,6 @@ import time
 from collections import deque
 from contextlib import suppress
 from functools import partial
-from queue import Empty, SimpleQueue
 from threading import Event, Thread
 
 from redis.exceptions import RedisError, WatchError
@@ -24,8 +23,6 @@ TICK_S = 0.5
 RETRY_S = 1.0
 """Longest time between two tries to reach it."""
 TIMEOUT_S = 2.0
-MAX_WAITING = 20_000
-"""Records that wait for Redis to come back, about 60 MB; of more, the oldest are left out, and a warning says so."""
 BATCH = 500
 KEPT = 100
 """Records that are sent again over a new connection. Redis flushes its file every second, so one that is killed may
@@ -68,11 +65,9 @@ class RedisWriter:
         """Status and grid as they are now."""
         self._there: dict[Content, RunStatus | GoalGrid] = {}
         """Status and grid as Redis has them."""
-        self._told: SimpleQueue[tuple[int, str]] = SimpleQueue()
-        """Iterations and texts of records that the thread has not seen yet."""
         self._waiting: list[tuple[int, str]] = []
+        """Iterations and texts of records: the run adds them at the end, the thread takes them from the front."""
         self._sent: deque[tuple[int, str]] = deque(maxlen=KEPT)
-        self._num_lost = 0
         self._stop = False
         self._away: tuple[float, str] | None = None
         self._replaced = False
@@ -87,7 +82,7 @@ class RedisWriter:
 
     def metrics(self, record: Record) -> None:
         """Append one iteration's metrics; those of it and of later ones, made before the run went back, are dropped."""
-        self._told.put((int(record["iteration"] or 0), json.dumps(plain(record))))
+        self._waiting.append((int(record["iteration"] or 0), json.dumps(plain(record))))
 
     def goals(self, grid: GoalGrid) -> None:
         """Replace the grid."""
@@ -104,15 +99,13 @@ class RedisWriter:
             since_s = time.monotonic() - away[0]
             found.append(
                 f"Redis at {self._address} has taken nothing for {since_s:.0f} s: {away[1]}; "
-                f"{self._num_waiting()} records wait for it"
+                f"{len(self._waiting)} records wait for it"
             )
         if self._replaced:
             found.append(
                 f"Redis at {self._address} gets nothing more: another process reports there as run {self._run_id}; "
                 "give one of the two runs another name"
             )
-        if self._num_lost:
-            found.append(f"{self._num_lost} records did not reach Redis; metrics.jsonl has them")
         return [Trouble("redis", text) for text in found]
 
     def close(self, timeout_s: float = 2.0) -> None:
@@ -147,7 +140,7 @@ class RedisWriter:
                 if self._away is not None:
                     _logger.info("Redis at %s is back after %.0f s", self._address, time.monotonic() - self._away[0])
                 self._away = None
-                pause_s = 0.0 if self._num_waiting() else TICK_S
+                pause_s = 0.0 if self._waiting else TICK_S
         with suppress(RedisError, OSError):  # it expires by itself
             if not self._replaced:
                 self._client.delete(self._key("heartbeat"))
@@ -159,7 +152,7 @@ class RedisWriter:
         Raises:
             RunTakenError: a newer process reports under this run id.
         """
-        self._take_in()
+        del self._waiting[: -keys.MAX_RECORDS]  # Redis would keep no more of them
         newest, records = dict(self._newest), self._waiting[:BATCH]
         with self._client.pipeline() as pipe:
             pipe.watch(self._key("epoch"))
@@ -182,29 +175,17 @@ class RedisWriter:
             self._stop = bool(pipe.execute()[-1])
         self._there = newest
         self._sent.extend(records)
-        del self._waiting[:BATCH]
+        del self._waiting[: len(records)]
         if self._connected_anew.is_set():  # a Redis that was killed has forgotten what came last
             self._connected_anew.clear()
             self._there = {}
             self._waiting[:0] = self._sent
             self._sent.clear()
 
-    def _take_in(self) -> None:
-        """Take in the records that were told, and leave out the oldest of too many."""
-        with suppress(Empty):
-            while True:
-                self._waiting.append(self._told.get_nowait())
-        num_lost = max(0, len(self._waiting) - MAX_WAITING)
-        del self._waiting[:num_lost]
-        self._num_lost += num_lost
-
     def _is_newer(self, found: bytes | None) -> bool:
         """Whether the process of an epoch in Redis began after this one; one from an older copy of its data did not."""
         run, _, epoch = (found or self._mine).partition(b":")
         return run != self._run or not epoch.isdigit() or int(epoch) > self._epoch
 
-    def _num_waiting(self) -> int:
-        return self._told.qsize() + len(self._waiting)
-
     def _pending(self) -> bool:
-        return self._num_waiting() > 0 or self._newest != self._there
+        return bool(self._waiting) or self._newest != self._there

@@ -117,18 +117,17 @@ def test_a_restart_between_two_messages_is_noticed(redis, reader, monkeypatch):
     assert reader.goals("cube") == a_grid(10)
 
 
-def test_too_many_records_for_memory_are_counted(redis, writer, reader, monkeypatch):
-    monkeypatch.setattr(redis_writer, "MAX_WAITING", 10)
+def test_no_more_records_wait_than_redis_keeps(redis, writer, reader, monkeypatch):
+    monkeypatch.setattr(address, "MAX_RECORDS", 10)
     writer.status(a_status())
     wait_until(lambda: reader.runs() != [])
     redis.kill()
     wait_until(writer.troubles)
     for number in range(1, 16):
         writer.metrics(a_record(number))
-    wait_until(lambda: "5 records did not reach Redis" in writer.troubles()[-1].text)
+    wait_until(lambda: "; 10 records wait for it" in writer.troubles()[0].text)
     redis.revive()
-    wait_until(lambda: len(iterations(reader)) == 10)
-    assert iterations(reader) == list(range(6, 16))
+    wait_until(lambda: iterations(reader) == list(range(6, 16)))
 
 
 def test_closing_sends_what_waits_and_history_in_redis_is_bounded(redis, reader, monkeypatch):
