@@ -18,46 +18,26 @@ def resumed_config(directory: RunDirectory | Path, overrides: list[str], file: P
 
     Args:
         directory: of the run; or the file with the configuration of a run of a study.
-        overrides: ``run.a=b`` strings, or learning rates; others may only say what the run has.
-        file: YAML that, with ``overrides``, says the same as the saved one where that may not change; where it may,
-            what it says comes before ``overrides``.
+        overrides: ``a.b=c`` strings.
+        file: YAML that may say again what the run was begun with; ``overrides`` come after it.
 
     Raises:
-        ConfigError: no run there, an override of anything else, or a file that says otherwise.
+        ConfigError: no run there, or anything else is to be another.
     """
     read = partial(load_config, directory) if isinstance(directory, Path) else directory.read_config
     saved = read()
-
-    def as_saved(given: Config) -> Config:
-        return given.as_in(saved) if type(given) is type(saved) else given
-
-    def says(override: str) -> bool:
-        try:
-            return as_saved(read([override])) == saved
-        except ConfigError:
-            return False
-
-    fixed = [override for override in overrides if not override.startswith(saved.resumable)]
-    for override in fixed:
-        if not says(override):
-            may = " and ".join(key.rstrip("=") if key.endswith("=") else f"{key}*" for key in saved.resumable)
+    given = read(overrides) if file is None else load_config(file, overrides, saved.code)
+    if type(given) is type(saved):
+        given = given.as_in(saved)
+    for key, (old, new) in _differences(saved.model_dump(mode="json"), given).items():
+        if not f"{key}=".startswith(saved.resumable):
+            may = " and ".join(each.rstrip("=") if each.endswith("=") else f"{each}*" for each in saved.resumable)
             raise ConfigError(
-                f"override {override!r}: a resumed run keeps its configuration; only {may} may change, for example "
-                "run.total_env_steps"
+                f"{key} = {new!r}, but the run has {old!r}; a resumed run keeps its configuration: only {may} may "
+                "change; leave it out, or start another run without --resume"
             )
-    changing = [override for override in overrides if override not in fixed]
-    if file is not None:
-        given = load_config(file, fixed, saved.code)
-        for key, (old, new) in _differences(saved.model_dump(mode="json"), as_saved(given)).items():
-            if not f"{key}=".startswith(saved.resumable):
-                raise ConfigError(
-                    f"{file}: {key} = {new!r}, but the run has {old!r}; a resumed run keeps its configuration: leave "
-                    "out --config, or start another run without --resume"
-                )
-        named = leaves(given.model_dump(mode="json", exclude_unset=True))
-        settings = [f"{key}={json.dumps(value)}" for key, value in named]
-        changing = [setting for setting in settings if setting.startswith(saved.resumable)] + changing
-    return read(changing)
+    named = leaves(given.model_dump(mode="json", exclude_unset=True))
+    return read([f"{key}={json.dumps(value)}" for key, value in named if f"{key}=".startswith(saved.resumable)])
 
 
 def changed_settings(saved: dict[str, Any], config: Config, directory: Path) -> dict[str, tuple[Any, Any]]:

@@ -412,8 +412,8 @@ def test_a_goal_of_a_film_is_in_no_fixture():
         (["--resume", "--config", "tiny.yaml"], ["--resume needs --run-dir"]),
         (["--resume", "--run-dir", "none"], ["no run in none"]),
         (["--registry", BUNDLED, "--run-dir", "run"], ["cannot write", BUNDLED, "only read"]),
-        (["--resume", "--run-dir", "RUN", "--set", "seed=3"], ["'seed=3'", "only run.*"]),
-        (["--resume", "--run-dir", "RUN", "--config", "OTHER"], ["seed = 3", "leave out --config"]),
+        (["--resume", "--run-dir", "RUN", "--set", "seed=3"], ["seed = 3, but the run has 0", "only run.*"]),
+        (["--resume", "--run-dir", "RUN", "--config", "OTHER"], ["seed = 3, but the run has 0", "without --resume"]),
         (["--run-dir", "OTHER"], ["cannot write", "other.yaml"]),
     ],
 )

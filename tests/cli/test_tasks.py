@@ -76,7 +76,7 @@ def test_resume_auto_begins_a_run_and_goes_on_with_it(tmp_path, monkeypatch):
     assert (config.primitives, config.task_version, result["env_steps"]) == (CHAMPION, 1, 600)
     more = tandem("train", "--resume", "--run-dir", path, "--set", "run.total_env_steps=800")
     assert "finished after 800 env steps" in more.stdout
-    assert_refused(tandem(*command, "--run-dir", path, "--set", "task=push"), "'task=push': a resumed run keeps")
+    assert_refused(tandem(*command, "--run-dir", path, "--set", "task=push"), "task = 'push', but the run has 'wall'")
     assert_refused(tandem("train", "push", "--resume=often"), "--resume 'often': choose one of auto, exactly")
 
 

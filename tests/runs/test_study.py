@@ -517,7 +517,7 @@ NOWHERE = ("--run-dir", "NOWHERE")
         ([], ["holds a study already", "--resume"]),
         (["--seeds", "0,1", "--set", "seed=3"], ["--set seed=3", "leave it out"]),
         (["--resume", "--seeds", "0-2"], ["has the runs seed-0, seed-1, not seed-0, seed-1, seed-2"]),
-        (["--resume", "--set", "game.num_worlds=3"], ["game.num_worlds=3", "keeps its configuration"]),
+        (["--resume", "--set", "game.num_worlds=3"], ["game.num_worlds = 3", "keeps its configuration"]),
         (["--resume", "--config", "OTHER"], ["game.num_goals", "keeps its configuration"]),
         (["--seeds", "0", "--run-dir", "RUN"], ["seed-0 holds a run already", "another --run-dir"]),
         (["--seeds", "0", "--run-dir", "PARENT"], ["seed-0 holds a run already", "another --run-dir"]),
