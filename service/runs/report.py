@@ -16,10 +16,12 @@ from service.config import Config
 from service.config.task import TaskConfig
 from service.runs.run import Run
 from service.store.models import CONDITIONS, RunState, RunStatus, RunTotals, Trial
-from service.store.run_writer import GOALS_INTERVAL_S, RunWriter
+from service.store.run_writer import RunWriter
 
 BEAT_S = 2.0
 """Time between two heartbeats of what follows learning."""
+GOALS_INTERVAL_S = 5.0
+"""Time between two grids of goals."""
 _MEASURED = {
     "success": "last",
     "success_low": "last_low",
@@ -131,7 +133,7 @@ class Report:
 
     def iteration(self, run: Run, metrics: Mapping[str, float]) -> None:
         """Tell an iteration's metrics, where the run is, and now and then what the generator knows; see ``beat``."""
-        self._writer.check()
+        run.directory.check_owner()
         self._writer.metrics(dict(metrics))
         if time.monotonic() - self._gridded_s >= GOALS_INTERVAL_S:
             self._gridded_s = time.monotonic()
@@ -152,7 +154,7 @@ class Report:
         Raises:
             RunTakenError: another process has taken it over.
         """
-        self._writer.check()
+        run.directory.check_owner()
         health, counters = run.method.health(), self._counters(run)
         for name, value in counters.items():
             self._totals[name] = self._totals.get(name, 0) + max(0, value - self._counted.get(name, 0))

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from service.store.redis_writer import RedisWriter
 
 STATUS_INTERVAL_S = 1.0
-GOALS_INTERVAL_S = 5.0
 _logger = logging.getLogger(__name__)
 
 
@@ -72,25 +71,21 @@ class RunWriter:
         """
         self._directory, self._redis = directory, redis
         self._stop_file = directory.path / STOP_FILE
-        self._status = _LatestFile(directory, STATUS_FILE, STATUS_INTERVAL_S, clock)
-        self._goals = _LatestFile(directory, GOALS_FILE, GOALS_INTERVAL_S, clock)
+        self._clock = clock
+        self._waiting: dict[str, BaseModel] = {}
+        """Newest status and grid by the names of their files, where these are older."""
+        self._written_s = float("-inf")
         self._told: tuple[RunState, Condition] | None = None
         with os_errors("write", self._stop_file):
             self._stop_file.unlink(missing_ok=True)
 
-    def check(self) -> None:
-        """Assert that this process is still the one that runs the run.
-
-        Raises:
-            RunTakenError: another one has taken it over; then nothing more may be written.
-        """
-        self._directory.check_owner()
-
     def status(self, status: RunStatus) -> None:
         """Replace what is known about the run."""
-        told = status.state, status.condition
-        self._status.put(status, now=told != self._told)
-        self._told = told
+        told, now_s = (status.state, status.condition), self._clock()
+        self._waiting[STATUS_FILE] = status
+        if told != self._told or now_s - self._written_s >= STATUS_INTERVAL_S:
+            self._told, self._written_s = told, now_s
+            self._write()
         if self._redis is not None:
             self._redis.status(status)
 
@@ -100,8 +95,8 @@ class RunWriter:
             self._redis.metrics(record)
 
     def goals(self, grid: GoalGrid) -> None:
-        """Replace the grid."""
-        self._goals.put(grid)
+        """Replace the grid; its file is written with the next status."""
+        self._waiting[GOALS_FILE] = grid
         if self._redis is not None:
             self._redis.goals(grid)
 
@@ -116,30 +111,13 @@ class RunWriter:
 
     def close(self) -> None:
         """Write what still waits, for a bounded time."""
-        self._status.flush()
-        self._goals.flush()
+        self._write()
         if self._redis is not None:
             self._redis.close()
 
-
-class _LatestFile:
-    """Holds the newest of what it is given, not older than ``interval_s`` when something newer comes."""
-
-    def __init__(self, directory: RunDirectory, name: str, interval_s: float, clock: Callable[[], float]) -> None:
-        self._directory, self._path, self._interval_s, self._clock = directory, directory.path / name, interval_s, clock
-        self._waiting: BaseModel | None = None
-        self._written_s = float("-inf")
-
-    def put(self, content: BaseModel, *, now: bool = False) -> None:
-        self._waiting = content
-        if now or self._clock() - self._written_s >= self._interval_s:
-            self.flush()
-
-    def flush(self) -> None:
-        content = self._waiting
-        if content is None:
-            return
-        self._written_s = self._clock()
-        with self._directory.keep_running(self._path):
-            write_atomic(self._path, content.model_dump_json().encode() + b"\n", flush=False)
-            self._waiting = None
+    def _write(self) -> None:
+        for name, content in list(self._waiting.items()):
+            path = self._directory.path / name
+            with self._directory.keep_running(path):
+                write_atomic(path, content.model_dump_json().encode() + b"\n", flush=False)
+                self._waiting.pop(name, None)  # a heartbeat's thread may have written it, too

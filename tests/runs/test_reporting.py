@@ -13,6 +13,7 @@ from service.base import lock
 from service.base.errors import DivergedError, RunTakenError, StoreUnavailableError, TandemError
 from service.base.lock import claim_epoch
 from service.registry.registry import Registry
+from service.runs import report
 from service.runs import train as module
 from service.runs.resuming import resumed_config
 from service.runs.signals import InterruptError
@@ -23,6 +24,7 @@ from service.store import redis_writer, run_writer
 from service.store.disk_reader import DiskReader
 from service.store.redis_reader import RedisReader
 from service.store.run_directory import RunDirectory
+from service.store.run_writer import RunWriter
 from tests.runs.runs import (
     assert_one_line,
     assert_same_run,
@@ -87,6 +89,15 @@ def test_a_run_tells_how_far_it_is_and_how_it_ended(tmp_path):
     assert (seen[0].state, seen[0].iteration, seen[0].published) == ("running", last.iteration, "tiny@1")
     assert seen[0].started > last.started
     assert status(tmp_path).published == "tiny@2"
+
+
+@pytest.mark.parametrize(("interval_s", "shown"), [(0.0, [1, 2, 3]), (3600.0, [1])])
+def test_a_run_tells_its_grid_now_and_then(tmp_path, monkeypatch, interval_s, shown):
+    monkeypatch.setattr(report, "GOALS_INTERVAL_S", interval_s)
+    told = []
+    monkeypatch.setattr(RunWriter, "goals", lambda writer, grid: told.append(grid.iteration))
+    run(tmp_path, on_iteration=lambda metrics: "finished" if metrics["iteration"] == 3 else None)
+    assert told == shown
 
 
 def test_a_stop_request_ends_the_run_after_its_iteration_saved(tmp_path):

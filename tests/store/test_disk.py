@@ -63,16 +63,17 @@ def test_status_is_written_once_a_second_and_at_changes_of_state_or_condition(tm
     assert read_json(tmp_path)["iteration"] == 5
 
 
-def test_the_grid_is_written_every_five_seconds_and_at_the_end(tmp_path, clock):
-    seen, writer = [], RunWriter(RunDirectory(tmp_path), clock=clock)
-    for number in range(1, 8):
-        writer.goals(a_grid(number))
-        seen.append(read_json(tmp_path, "goals.json")["iteration"])
-        clock.now_s += 1.0
-    assert seen == [1, 1, 1, 1, 1, 6, 6]
+def test_the_grid_is_written_with_the_next_status_and_at_the_end(tmp_path, clock):
+    writer = RunWriter(RunDirectory(tmp_path), clock=clock)
+    writer.goals(a_grid(1))
+    writer.status(a_status())
+    assert read_json(tmp_path, "goals.json")["iteration"] == 1
+    writer.goals(a_grid(2))
+    writer.status(a_status())  # within the same second
+    assert read_json(tmp_path, "goals.json")["iteration"] == 1
     writer.close()
-    assert read_json(tmp_path, "goals.json")["iteration"] == 7
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["goals.json"]
+    assert read_json(tmp_path, "goals.json")["iteration"] == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["goals.json", "status.json"]
 
 
 def test_a_full_disk_is_a_warning_and_passes(tmp_path, clock, caplog):
