@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import errno
+import logging
 import socket
 
 DEFAULT_PORT = 8321
 """Of the status service."""
 MAX_TRIED = 50
+_logger = logging.getLogger(__name__)
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -37,3 +39,20 @@ def free_port(host: str, first: int = 0) -> int:
             if error.errno != errno.EADDRINUSE:
                 raise
     return first
+
+
+def choose_port(host: str, port: int | None) -> int:
+    """The port of a status service: the one that is named; 0: any that is free; None: the usual one, or the next free.
+
+    A line says where the usual one is taken. What is wrong with a host is said where the service begins.
+    """
+    if port:
+        return port
+    first = DEFAULT_PORT if port is None else 0
+    try:
+        found = free_port(host, first)
+    except OSError:
+        return first
+    if first not in (0, found):
+        _logger.info("port %d is taken, so the status service is at port %d", first, found)
+    return found

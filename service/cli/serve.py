@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import socket
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Annotated
 
@@ -40,7 +39,7 @@ def serve(
     quiet: QuietOption = False,
 ) -> None:
     """Show finished and running runs and the registry over REST, to Prometheus, and to a browser."""
-    from service.base.ports import DEFAULT_PORT, free_port
+    from service.base.ports import choose_port
     from service.registry.registry import Registry
     from service.registry.token import VARIABLE, read_token
     from service.status.run_reader import open_reader
@@ -50,12 +49,7 @@ def serve(
     if not runs.is_dir():
         raise StatusError(f"no directory {runs}; name with --runs the one that holds run directories")
     token = read_token(token_file)
-    chosen = DEFAULT_PORT if port is None else port
-    if port is None:
-        with suppress(OSError):  # what is wrong with the host is said below
-            chosen = free_port(host, DEFAULT_PORT)
-        if chosen != DEFAULT_PORT:
-            logging.getLogger(__name__).info("port %d is taken, so this is at port %d", DEFAULT_PORT, chosen)
+    chosen = choose_port(host, port)
     server = StatusServer(open_reader(runs), Registry(registry), token=token, host=host, port=chosen, runs_dir=runs)
     typer.echo(f"runs of {runs}, primitives of {registry}: {server.url}")
     if token is None:

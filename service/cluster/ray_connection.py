@@ -14,7 +14,6 @@ from functools import partial
 from typing import Any
 
 from service.base.errors import TandemError, needs_extra, one_line
-from service.base.ports import DEFAULT_PORT
 from service.base.progress import answer, doing
 from service.methods.method import WorkersError
 from service.runs.signals import InterruptError, StopSignals
@@ -36,11 +35,9 @@ class StatusOptions:
     """Address and token of the status service of a run on a cluster."""
 
     host: str = "127.0.0.1"
-    port: int = DEFAULT_PORT
-    """0: one that is free."""
+    port: int | None = None
+    """See ``choose_port``."""
     token: str | None = field(default=None, repr=False)
-    or_next: bool = False
-    """Take the next free port where that one is taken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +61,7 @@ def parse_status(text: str | None, token: str | None) -> StatusOptions | None:
         WorkersError: neither.
     """
     if text is None:
-        return StatusOptions(token=token, or_next=True)
+        return StatusOptions(token=token)
     if text == "off":
         return None
     host, separator, port = text.rpartition(":")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,11 +11,10 @@ from typing import Any
 import ray
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from service.base.ports import free_port
+from service.base.ports import choose_port
 from service.cluster.ray_connection import StatusOptions
 from service.store.address import RedisAddress
 
-_logger = logging.getLogger(__name__)
 START_S = 60.0
 
 
@@ -50,23 +48,12 @@ class StatusWorker:
 
         reader, options = open_reader(self._runs_dir, self._redis), self._options
         registry = Registry(self._registry)
-        place: dict[str, Any] = {"host": options.host, "port": options.port, "runs_dir": self._runs_dir}
-        self._server = StatusServer(reader, registry, token=options.token, **place)
+        assert options.port is not None, "chosen"
+        self._server = StatusServer(
+            reader, registry, token=options.token, host=options.host, port=options.port, runs_dir=self._runs_dir
+        )
         self._server.start()
         return self._server.url
-
-
-def place(options: StatusOptions) -> StatusOptions:
-    """The options with the port that is taken in the end: a service that is restarted must be where it was."""
-    if options.port != 0 and not options.or_next:
-        return options
-    try:
-        port = free_port(options.host, options.port)
-    except OSError:  # what is wrong with the host is said where the service begins
-        return options
-    if options.port not in (0, port):
-        _logger.info("port %d is taken, so the status service is at port %d", options.port, port)
-    return replace(options, port=port)
 
 
 @contextmanager
@@ -82,7 +69,9 @@ def serving(options: StatusOptions, runs_dir: Path, registry: Path, redis: Redis
     """
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
     actor = ray.remote(StatusWorker).options(num_cpus=0, max_restarts=-1, scheduling_strategy=here)
-    handle: Any = actor.remote(place(options), runs_dir.absolute(), registry.absolute(), redis)
+    # chosen once: a service that is restarted must be where it was
+    placed = replace(options, port=choose_port(options.host, options.port))
+    handle: Any = actor.remote(placed, runs_dir.absolute(), registry.absolute(), redis)
     try:
         url: str = ray.get(handle.start.remote(), timeout=START_S)
         yield url

@@ -6,10 +6,9 @@ from contextlib import contextmanager
 import pytest
 from typer.testing import CliRunner
 
-from service.base.ports import DEFAULT_PORT, free_port
+from service.base.ports import DEFAULT_PORT, choose_port, free_port
 from service.cli.main import app
 from service.cluster.ray_connection import StatusOptions, parse_status
-from service.cluster.status_actor import place
 
 
 @contextmanager
@@ -51,17 +50,27 @@ def test_serve_takes_the_next_one_unless_told_which(tmp_path, monkeypatch, busy,
     assert result.exit_code == 0, result.output
     chosen = int(result.stdout.splitlines()[0].rpartition(":")[2])
     assert busy < chosen < busy + 50
-    assert f"port {busy} is taken, so this is at port {chosen}" in caplog.messages
+    assert f"port {busy} is taken, so the status service is at port {chosen}" in caplog.messages
     told = CliRunner().invoke(app, ["serve", "--port", str(busy)])
     assert told.exit_code == 2
     assert f"port {busy} of 127.0.0.1 is taken" in told.stderr
 
 
-def test_a_run_on_ray_does_the_same(caplog):
-    assert parse_status(None, "secret") == StatusOptions("127.0.0.1", DEFAULT_PORT, "secret", or_next=True)
-    with taken() as port, caplog.at_level("INFO"):
-        placed = place(StatusOptions(port=port, or_next=True))
-        assert port < placed.port < port + 50
-        assert caplog.messages == [f"port {port} is taken, so the status service is at port {placed.port}"]
-        named = StatusOptions(port=port)
-        assert place(named) == named  # which fails when it is started
+@pytest.mark.parametrize(("port", "other"), [(7, "127.0.0.1"), (0, "203.0.113.7"), (None, "203.0.113.7")])
+def test_what_is_wrong_with_a_port_or_a_host_is_said_where_the_service_begins(port, other):
+    assert choose_port(other, port) == (DEFAULT_PORT if port is None else port)
+
+
+def test_a_port_is_chosen(busy, caplog):
+    with caplog.at_level("INFO"):
+        assert choose_port("127.0.0.1", busy) == busy
+        assert choose_port("127.0.0.1", 0) > 1023
+        assert caplog.messages == []
+        found = choose_port("127.0.0.1", None)
+    assert busy < found < busy + 50
+    assert caplog.messages == [f"port {busy} is taken, so the status service is at port {found}"]
+
+
+def test_a_run_on_ray_takes_the_usual_port_or_the_next():
+    assert parse_status(None, "secret") == StatusOptions("127.0.0.1", None, "secret")
+    assert parse_status("::1:7", None) == StatusOptions("::1", 7)
