@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from itertools import product
 from math import prod
 
 import yaml
 
 from service.base.errors import ConfigError
-from service.base.parsing import ParseError, parse_yaml
 
 MAX_RUNS = 1000
 MAX_NAME = 100
@@ -59,7 +57,7 @@ def parse_grid(grids: Sequence[str], seeds: str | None = None) -> dict[str, list
             raise ConfigError(
                 f"--grid {text!r}: expected KEY=VALUE,VALUE, for example learner.bob.learning_rate=1e-4,3e-4"
             )
-        check_once(f"--grid {text!r}", [_as_read(part) for part in parts])
+        check_once(f"--grid {text!r}", parts)
         if key in found:
             raise ConfigError(f"--grid {text!r}: {key} is given by another --grid, too; write all its values in one")
         found[key] = parts
@@ -68,13 +66,6 @@ def parse_grid(grids: Sequence[str], seeds: str | None = None) -> dict[str, list
             raise ConfigError(f"--seeds {seeds} and --grid {SEED}=...: give one of them")
         found[SEED] = list(map(str, parse_seeds(seeds)))
     return found
-
-
-def _as_read(text: str) -> str:
-    """A value as it is read, such as 0 for 00; what cannot be read is told of with its key, later."""
-    with suppress(ParseError):
-        return str(parse_yaml(text, "its value"))
-    return text
 
 
 def check_once(option: str, values: Sequence[str]) -> None:

@@ -122,7 +122,6 @@ def test_a_grid_has_values_as_they_are_typed(texts, grid):
         *(([text], None, "KEY=VALUE,VALUE") for text in ("a", "=1", "a=", "a=1,", "a=,1", "a=[1,2", "a=1],[2")),
         (["a=" + "[" * 5000], None, "KEY=VALUE,VALUE"),
         (["a=1,2,1"], None, "1 given twice"),
-        (["seed=0,00"], None, "0 given twice"),
         (["a=1", "a=2"], None, "a is given by another --grid"),
         (["seed=1,2"], "0", "--seeds 0 and --grid seed"),
     ],
