@@ -33,8 +33,6 @@ from service.store.models import (
     RunReader,
     RunStatus,
 )
-from service.store.run_history import FILE as RUN_FILE
-from service.store.run_history import FIRST_VERSION, written_by
 from service.store.tail import RecordFile
 
 QUIET_S = 10.0
@@ -167,7 +165,7 @@ class DiskReader(RunReader):
             status = parse_with(RunStatus.model_validate_json, read_regular(path / STATUS_FILE, MAX_BYTES), STATUS_FILE)
         except FileNotFoundError:
             begun = f"{path} has no {STATUS_FILE}: its run has only begun, or it is gone; resume it"
-            return _damaged(run_id, path, begun if (path / RUN_FILE).exists() else written_by(path, FIRST_VERSION))
+            return _damaged(run_id, path, begun)
         if status.epoch < newest_epoch(path):
             text = f"{STATUS_FILE} is of an earlier process; a newer one has written none yet"
             status = status.suffering("well", text)

@@ -50,13 +50,13 @@ from service.config import Config, dump_config, load_config
 from service.store.checkpoints import CheckpointStore
 from service.store.models import STUDY_FILE
 from service.store.run_history import (
-    FIRST_VERSION,
+    BEFORE,
     Event,
     RunHistory,
     is_of_this_version,
     read_history,
     read_note,
-    written_by,
+    written_for,
 )
 
 if TYPE_CHECKING:
@@ -148,9 +148,9 @@ class RunDirectory:
         if not self.exists:
             raise ConfigError(f"no run in {self.path}: {self.config_file.name} is missing; name the directory of a run")
         history = read_history(self.path)
-        version = history.tandem if history is not None else FIRST_VERSION
+        version = history.tandem if history is not None else BEFORE
         if not is_of_this_version(version):
-            raise ConfigError(written_by(self.path, version))
+            raise ConfigError(written_for(self.path, version))
         return load_config(self.config_file, overrides)
 
     def start(self, config: Config, resumption: Resumption | None = None) -> None:

@@ -16,8 +16,8 @@ from service.base.version import __version__
 from service.config.frozen import FrozenModel
 
 FILE = "run.json"
-FIRST_VERSION, SECOND_VERSION = "0.1.0", "0.2.0"
-"""Versions that wrote no ``run.json``, and one that does not say which version wrote it."""
+BEFORE = "0.2"
+"""The version that reads runs which do not say their version: its own, and those of 0.1, which have no ``run.json``."""
 MAX_BYTES = 16 * 1024 * 1024
 _Note = TypeVar("_Note")
 
@@ -35,7 +35,7 @@ class RunHistory(FrozenModel):
     """Content of ``run.json``."""
 
     run: str = Field(pattern=r"^[0-9a-f]{32}$", description="identity, drawn at random when the run began")
-    tandem: str = Field(SECOND_VERSION, description="version that began the run")
+    tandem: str = Field(BEFORE, description="version that began the run")
     events: tuple[Event, ...] = ()
 
     @classmethod
@@ -52,10 +52,9 @@ class RunHistory(FrozenModel):
         write_atomic(directory / FILE, self.model_dump_json(indent=1).encode() + b"\n")
 
 
-def written_by(path: Path, version: str) -> str:
+def written_for(path: Path, version: str) -> str:
     """Say of what another version has written which version reads it."""
-    reader = "0.2" if version.startswith("0.1.") else version
-    return f"{path} was written by tandem {version}, which this version does not read: use tandem {reader}"
+    return f"{path} is of another version of tandem, which this one does not read: use tandem {version}"
 
 
 def is_of_this_version(version: str) -> bool:
@@ -64,7 +63,7 @@ def is_of_this_version(version: str) -> bool:
 
 
 def read_history(directory: Path) -> RunHistory | None:
-    """Read a run's history; None where there is none, as of a run of version 0.1.0.
+    """Read a run's history; None where there is none, as of a run of version 0.1.
 
     Raises:
         StorageError: it cannot be read, or is damaged.

@@ -96,8 +96,7 @@ def test_a_run_of_before_names_the_version_that_reads_it(run, tmp_path, version)
         (path / "run.json").unlink()
     with pytest.raises(TandemError) as error:
         load(str(path))
-    said = f"written by tandem {version}, which this version does not read: use tandem 0.2"
-    assert_one_line(error.value, path, said)
+    assert_one_line(error.value, path, "of another version of tandem, which this one does not read: use tandem 0.2")
 
 
 @pytest.mark.parametrize("reference", ["tiny@1", "tiny@champion"])

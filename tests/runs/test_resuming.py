@@ -130,8 +130,8 @@ def test_a_configuration_that_may_change_is_said_and_noted(run, caplog):
     assert event.changed["run.total_env_steps"] == (600, 800)
 
 
-@pytest.mark.parametrize("version", ["0.1.0", "0.2.0", "0.4.1"])
-def test_a_run_of_another_version_is_left_alone(run, version):
+@pytest.mark.parametrize(("version", "reader"), [("0.1.0", "0.2"), ("0.2.0", "0.2"), ("0.4.1", "0.4.1")])
+def test_a_run_of_another_version_is_left_alone(run, version, reader):
     identity = json.loads((run / "run.json").read_text()) | {"tandem": version}
     if version == "0.2.0":
         del identity["tandem"]
@@ -141,8 +141,9 @@ def test_a_run_of_another_version_is_left_alone(run, version):
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     with pytest.raises(ConfigError) as error:
         resumed_config(RunDirectory(run), [])
-    reader = "0.2" if version == "0.1.0" else version
-    assert_one_line(error.value, run, f"by tandem {version}, which this version does not read: use tandem {reader}")
+    assert str(error.value) == (
+        f"{run} is of another version of tandem, which this one does not read: use tandem {reader}"
+    )
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 

@@ -111,13 +111,11 @@ def ended(tmp_path):
     return directory
 
 
-def test_a_run_without_a_status_has_only_begun_or_is_of_version_0_1_0(ended):
+def test_a_run_without_a_status_has_only_begun(ended):
     (ended / "status.json").unlink()
     run = DiskReader(ended.parent).run("old-one")
     assert run.state == "interrupted"
     assert_one_line(run.last_error, ended, "has no status.json")
-    (ended / "run.json").unlink()
-    assert_one_line(DiskReader(ended.parent).run("old-one").last_error, "tandem 0.1.0", "use tandem 0.2")
 
 
 def test_a_status_of_an_earlier_process_says_so(ended):
