@@ -117,18 +117,19 @@ def champion() -> Trained:
 
 @pytest.fixture
 def full_disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Call with "write" or "fsync": from then on that call finds the disk full; a write first stores half its bytes."""
-    real_write = os.write
+    """Call with "write" or "fsync": from then on that finds the disk full; a write first stores half its bytes."""
 
-    def _write(descriptor: int, data: memoryview) -> int:
-        if len(data) > 1:
-            return real_write(descriptor, data[: len(data) // 2])
+    def _write(path: Path, data: bytes) -> None:
+        path.write_bytes(data[: len(data) // 2])
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _fsync(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _fill(call: str) -> None:
-        monkeypatch.setattr(os, call, {"write": _write, "fsync": _fsync}[call])
+        if call == "write":
+            monkeypatch.setattr("service.base.files._write_flushed", _write)
+        else:
+            monkeypatch.setattr(os, "fsync", _fsync)
 
     return _fill

@@ -237,15 +237,10 @@ def _temporary_name() -> str:
 
 
 def _write_flushed(path: Path, data: bytes) -> None:
-    # 0o666 before the umask: tempfile's 0o600 would lock colleagues out of a shared registry
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
-    try:
-        view = memoryview(data)
-        while view:
-            view = view[os.write(descriptor, view) :]
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    with open(path, "xb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _flush_directory(directory: Path) -> None:

@@ -49,18 +49,17 @@ def decode(data: bytes) -> dict[str, np.ndarray]:
     return {name: arrays[name].copy() for name in sorted(arrays)}
 
 
-def read_metadata(data: bytes) -> dict[str, str]:
-    """The text in the header of safetensors bytes.
+def read_metadata(data: bytes, key: str) -> str:
+    """A text in the header of safetensors bytes.
 
     Raises:
         ValueError: not safetensors.
+        KeyError: it has no such text.
+        TypeError: the header is something else.
     """
     length = int.from_bytes(data[:8], "little")
-    if length > len(data) - 8:
-        raise ValueError("not a whole safetensors file: the header is cut short")
-    header = parse_json(data[8 : 8 + length], "the header")
-    metadata = header.get("__metadata__", {}) if isinstance(header, dict) else {}
-    return {str(key): str(value) for key, value in metadata.items()} if isinstance(metadata, dict) else {}
+    text: str = parse_json(data[8 : 8 + length], "the header")["__metadata__"][key]
+    return text
 
 
 def digest_of(text: str, arrays: Mapping[str, np.ndarray]) -> str:

@@ -144,7 +144,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     with os_errors("read", path, CheckpointError):
         data = read_regular(path, follow=True)
     try:
-        header = parse_json(tensors.read_metadata(data)[_HEADER_KEY], path, allow_nan=True)
+        header = parse_json(tensors.read_metadata(data, _HEADER_KEY), path, allow_nan=True)
         format_version = header["format_version"]
     except (ValueError, KeyError, TypeError):
         raise CheckpointError(f"{path} is damaged: its header cannot be read") from None

@@ -25,8 +25,9 @@ def test_equal_arrays_give_equal_bytes_whatever_their_order() -> None:
 
 def test_metadata_is_read_back() -> None:
     data = tensors.encode({"a": np.zeros(2)}, {"key": 'a "quoted"\ntext'})
-    assert tensors.read_metadata(data) == {"key": 'a "quoted"\ntext'}
-    assert tensors.read_metadata(tensors.encode({"a": np.zeros(2)})) == {}
+    assert tensors.read_metadata(data, "key") == 'a "quoted"\ntext'
+    with pytest.raises(KeyError):
+        tensors.read_metadata(tensors.encode({"a": np.zeros(2)}), "key")
 
 
 @pytest.mark.parametrize("array", [np.array(["text"]), np.array([object()]), np.zeros(2, dtype=np.complex128)])
