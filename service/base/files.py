@@ -27,6 +27,8 @@ from service.base.errors import StorageError
 TEMPORARY_PREFIX = ".tmp-"
 MAX_BYTES = 8 * 1024**3
 """Greatest size of a file of a run: of a million iterations its records have some two gigabytes."""
+END_BYTES = 16 * 1024
+"""Of the end of a text file."""
 
 
 def open_regular(path: Path, *, follow: bool = False) -> BinaryIO:
@@ -67,6 +69,18 @@ def read_regular(path: Path, max_bytes: int = MAX_BYTES, *, follow: bool = False
         if size > max_bytes:
             raise OSError(errno.EFBIG, f"longer than {max_bytes} bytes", str(path))
         return file.read(size)
+
+
+def last_lines(path: Path) -> list[str]:
+    """The lines at the end of a text file, without empty ones and one that is cut; none where it cannot be read."""
+    try:
+        with open_regular(path) as file:
+            begin = max(0, file.seek(0, os.SEEK_END) - END_BYTES)
+            file.seek(begin)
+            text = file.read(END_BYTES).decode(errors="replace")
+    except OSError:
+        return []
+    return [line for line in text.replace("\r", "\n").split("\n")[1 if begin else 0 :] if line.strip()]
 
 
 def _descriptor(path: Path, flags: int, *, follow: bool) -> int:

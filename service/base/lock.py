@@ -48,7 +48,7 @@ class DirectoryLock:
     """
 
     def __init__(self, directory: Path, what_to_do: str) -> None:
-        path = directory / LOCK_FILE
+        self._path = path = directory / LOCK_FILE
         with os_errors("write", path):
             directory.mkdir(parents=True, exist_ok=True)
             self._file = open_to_append(path)
@@ -73,8 +73,16 @@ class DirectoryLock:
             self._file.truncate(0)
             self._file.write(json.dumps(note).encode())
 
-    def release(self) -> None:
-        """Let others in; a second call does nothing."""
+    def release(self, *, begun: bool = True) -> None:
+        """Let others in.
+
+        Args:
+            begun: whether anything has begun in the directory; else it goes, if nothing else is in it.
+        """
+        if not begun:
+            with contextlib.suppress(OSError):
+                self._path.unlink()
+                self._path.parent.rmdir()
         self._file.close()
 
 

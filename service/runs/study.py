@@ -25,7 +25,7 @@ from pydantic import Field, ValidationError
 
 from service.base.errors import ConfigError, StorageError, StoreError, TandemError
 from service.base.files import os_errors, read_regular, write_atomic
-from service.base.lock import LOCK_FILE, DirectoryLock
+from service.base.lock import DirectoryLock
 from service.base.parsing import ParseError, parse_json
 from service.base.progress import answer, counted
 from service.config import Config, dump_config
@@ -113,11 +113,7 @@ class Study:
     def close(self) -> None:
         """Let other processes in; a second call does nothing."""
         if self._lock is not None:
-            if not self.exists:  # a study that did not begin leaves nothing
-                with suppress(OSError):
-                    (self.path / LOCK_FILE).unlink()
-                    self.path.rmdir()
-            self._lock.release()
+            self._lock.release(begun=self.exists)
             self._lock = None
 
     def check_free(self, names: Iterable[str]) -> None:

@@ -16,7 +16,7 @@ from typing import Literal
 from pydantic import Field
 
 from service.base.errors import TandemError
-from service.base.files import open_regular, open_to_append, os_errors, write_atomic
+from service.base.files import last_lines, open_to_append, os_errors, write_atomic
 from service.base.lock import is_locked
 from service.config import Config
 from service.config.frozen import FrozenModel
@@ -32,8 +32,6 @@ TAKEN_S = 60.0
 """Time that the process of an earlier study has to end, which is told that its study is gone."""
 PATIENCE_S = (1.0, 5.0, 5.0)
 """Time that a process has to end after SIGTERM, a second SIGTERM, and SIGKILL."""
-LAST_WORDS_BYTES = 100_000
-"""End of a log in which a run said why it failed."""
 Asked = Callable[[], int]
 """Says ``GO_ON``, ``STOP`` or ``END_NOW``."""
 
@@ -158,12 +156,8 @@ def _reason(log_file: Path, code: int) -> str:
     if code < 0:
         said = f"ended by {Signals(-code).name}"
     else:
-        text = ""
-        with suppress(OSError), open_regular(log_file) as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - LAST_WORDS_BYTES))
-            text = file.read().decode(errors="replace")
-        lines = [line.strip() for line in text.splitlines()[-20:] if line.strip()]
-        said = (lines[-1] if lines else f"exit code {code}").removeprefix("error: ")
+        lines = last_lines(log_file)
+        said = lines[-1].strip().removeprefix("error: ") if lines else f"exit code {code}"
     return f"{said[:500]}; all it said is in {log_file}"
 
 

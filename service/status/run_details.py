@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from service.base.errors import ConfigError, StorageError
-from service.base.files import open_regular
+from service.base.files import last_lines, open_regular
 from service.base.parsing import ParseError, parse_json
 from service.config.tree import read_yaml
 from service.generator.records import of_furthest
@@ -23,7 +23,6 @@ from service.store.run_log import LogLine, read_log
 DEFAULT_CELL_M = 0.05
 FRAME_BYTES = 256 * 1024
 """Of the records of goals that are read for one frame, some thousand goals."""
-_OUTPUT_BYTES = 16 * 1024
 
 
 def setup(run: RunStatus, directory: Path | None, registry: Path) -> RunSetup:
@@ -85,9 +84,8 @@ def log(directory: Path | None, limit: int) -> RunLog:
         text = f"from iteration {event.after_iteration}: {'; '.join(said)}"
         entries.append(LogLine(at=event.at, level="info", text=text))
     entries.sort(key=lambda entry: entry.at)
-    return RunLog(
-        entries=tuple(entries[-limit:]), num_entries=len(entries), output=tuple(_output(directory / OUTPUT_FILE))
-    )
+    output = tuple(line[:500] for line in last_lines(directory / OUTPUT_FILE)[-100:])
+    return RunLog(entries=tuple(entries[-limit:]), num_entries=len(entries), output=output)
 
 
 def goal_frames(directory: Path | None, grid: GoalGrid | None, num_frames: int) -> GoalFrames:
@@ -140,16 +138,3 @@ def _frame(lines: list[bytes], lower: np.ndarray[Any, np.dtype[np.float64]], cel
         num_tries=tuple(tries.tolist()),
         success_rate=tuple(np.round(solved / tries, 4).tolist()),
     )
-
-
-def _output(path: Path) -> list[str]:
-    """The last lines of a text file; empty where there is none."""
-    try:
-        with open_regular(path) as file:
-            size = file.seek(0, 2)
-            file.seek(max(0, size - _OUTPUT_BYTES))
-            text = file.read(_OUTPUT_BYTES).decode(errors="replace")
-    except OSError:
-        return []
-    lines = text.replace("\r", "\n").split("\n")
-    return [line[:500] for line in lines[1 if size > _OUTPUT_BYTES else 0 :] if line.strip()][-100:]

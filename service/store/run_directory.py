@@ -42,7 +42,7 @@ from pydantic import BaseModel, JsonValue, TypeAdapter
 from service.base.errors import CheckpointError, ConfigError, RunTakenError, StorageError, TandemError
 from service.base.files import Appender, os_errors, remove_temporaries, write_atomic
 from service.base.jsonl import Extent, JsonlWriter
-from service.base.lock import LOCK_FILE, DirectoryLock, claim_epoch, give_back_epoch, newest_epoch
+from service.base.lock import DirectoryLock, claim_epoch, give_back_epoch, newest_epoch
 from service.base.parsing import parse_json
 from service.base.types import FloatArray, StateArray
 from service.base.version import LEARNING_VERSION, git_commit
@@ -348,11 +348,7 @@ class RunDirectory:
         if self._lock is not None:
             if self._events is None:  # it did not start
                 give_back_epoch(self.path, self.epoch)
-            if not self.exists:  # nor did any other; the directory goes if nothing else is in it
-                with suppress(OSError):
-                    (self.path / LOCK_FILE).unlink()
-                    self.path.rmdir()
-            self._lock.release()
+            self._lock.release(begun=self.exists)
             self._lock = None
             self.epoch = 0
         self._events = None

@@ -105,6 +105,15 @@ def test_a_file_is_read_whole_and_no_more_than_is_allowed(tmp_path):
         read_regular(path)
 
 
+def test_the_last_lines_of_a_text_are_whole_and_not_empty(tmp_path, monkeypatch):
+    path = tmp_path / "log.txt"
+    assert files.last_lines(path) == []
+    path.write_bytes(b"one\n\n1 %\r2 %\r\nno t\xffext")
+    assert files.last_lines(path) == ["one", "1 %", "2 %", "no t\ufffdext"]
+    monkeypatch.setattr(files, "END_BYTES", 13)
+    assert files.last_lines(path) == ["no t\ufffdext"]  # of the line before, a part
+
+
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda path: path.symlink_to("/dev/zero")])
 def test_what_is_no_file_is_neither_read_nor_written(tmp_path, make):
     path = tmp_path / "other"
