@@ -25,7 +25,7 @@ CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 NUM_ENDED_RUNS = 5
 MAX_RUNS = 50
 _STATES: tuple[RunState, ...] = get_args(RunState)
-_ACTOR_STATES: tuple[Literal["starting", "alive", "lost"], ...] = get_args(ActorStatus.model_fields["state"].annotation)
+_ACTOR_STATES: tuple[Literal["starting", "alive"], ...] = get_args(ActorStatus.model_fields["state"].annotation)
 _logger = logging.getLogger(__name__)
 _Family = CounterMetricFamily | GaugeMetricFamily
 

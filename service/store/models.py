@@ -93,7 +93,7 @@ class ActorStatus(FrozenModel):
 
     name: str = Field(description="rollout-0, rollout-1, ..., learner, generator")
     incarnation: int = Field(ge=0, description="how often it was replaced")
-    state: Literal["starting", "alive", "lost"]
+    state: Literal["starting", "alive"]
     node: str = Field("", description="host it is on; empty in a run of one process")
     pid: int | None = None
     heartbeat: AwareDatetime = Field(description="UTC, when it was last heard of")

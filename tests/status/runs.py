@@ -50,7 +50,7 @@ def status(run_id: str, **changes: Any) -> RunStatus:
         },
         "actors": (
             ActorStatus(name="rollout-0", incarnation=2, state="alive", heartbeat=now, last_error="killed"),
-            ActorStatus(name="rollout-1", incarnation=0, state="lost", heartbeat=now),
+            ActorStatus(name="rollout-1", incarnation=0, state="starting", heartbeat=now),
             ActorStatus(name="learner", incarnation=1, state="alive", heartbeat=now),
         ),
     }

@@ -58,7 +58,7 @@ def test_metrics_of_a_run(service):
     }
     assert {name: value(samples, name, run="cube") for name in expected} == expected
     assert value(samples, "tandem_run_actors", run="cube", state="alive") == 2
-    assert value(samples, "tandem_run_actors", run="cube", state="lost") == 1
+    assert value(samples, "tandem_run_actors", run="cube", state="starting") == 1
     assert value(samples, "tandem_run_info", run="cube", name="panda-cube", runtime="ray") == 1
     assert value(samples, "tandem_run_state", run="cube", state="running") == 1
     assert value(samples, "tandem_run_state", run="cube", state="failed") == 0

@@ -99,7 +99,7 @@ def test_a_run(visit):
     assert "6\n1 refused" in re.sub("\n+", "\n", tiles["Rollouts"])
     rows = page.get_by_role("table", name="Actors").locator("tbody tr")
     texts = [row.locator("td").all_inner_texts() for row in rows.all()]
-    assert [text[0] for text in texts] == ["rollout-1", "learner", "rollout-0"]  # the lost one first
+    assert [text[0] for text in texts] == ["rollout-1", "learner", "rollout-0"]  # the starting one first
     assert texts[2][1:4] == ["alive", "2", "this machine"]
     assert re.fullmatch(rf"\d+{NBSP}(s|min) ago", texts[2][4])
     assert texts[2][7] == "killed"

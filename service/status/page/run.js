@@ -19,7 +19,7 @@ const GOALS_MS = 5000;
 const FILES_MS = 15_000;
 const CURVES_MS = 2000;
 const BOB = "bob/success_rate";
-const ORDER = ["lost", "starting", "alive"];
+const ORDER = ["starting", "alive"];
 
 /** Show a run until ``signal`` aborts. */
 export function runView(root, runId, signal) {
@@ -219,7 +219,7 @@ function tile(label, small = "") {
   return { root, bar, set };
 }
 
-/** The table of RunStatus.actors, lost ones first; if the run has ended, with their last values. */
+/** The table of RunStatus.actors, starting ones first; if the run has ended, with their last values. */
 class ActorTable {
   constructor() {
     this.table = new Table(
