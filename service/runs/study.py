@@ -39,13 +39,12 @@ from service.runs.study_results import SELECTED, as_csv, best_of, published_metr
 from service.runs.study_run import END_NOW, GO_ON, POLL_S, STOP, Job, Place, StudyRun, share
 from service.runs.train import publish_learned
 from service.store.disk_reader import DiskReader, run_id_of
-from service.store.models import STUDY_FILE
+from service.store.models import MAX_BYTES, STUDY_FILE
 from service.store.run_directory import RunDirectory
 from service.store.run_history import BEFORE, written_for
 
 SHOW_S = 1.0
 """Time between two looks into the run directories."""
-MAX_BYTES = 64 * 1024 * 1024
 _logger = logging.getLogger(__name__)
 
 
@@ -153,7 +152,7 @@ class Study:
             StorageError: they cannot be written.
         """
         for name, config in configs.items():
-            self._put(self.config_file(name), dump_config(config))
+            write_atomic(self.config_file(name), dump_config(config).encode())
 
     def train(
         self,
@@ -242,7 +241,7 @@ class Study:
             except TandemError as error:  # a damaged checkpoint
                 self._note(name, runs[name].now("failed", str(error)))
         runs = self._study.runs
-        self._put(self.path / "results.csv", as_csv(runs))
+        write_atomic(self.path / "results.csv", as_csv(runs).encode())
         with suppress(TandemError):  # none has metrics yet
             plot_study({name: self.path / name for name in runs}, self.path / "curves.png")
         best = best_of(runs)
@@ -282,10 +281,7 @@ class Study:
 
     def _write(self, study: StudyFile) -> None:
         self._study = study
-        self._put(self.file, study.model_dump_json(indent=1) + "\n")
-
-    def _put(self, path: Path, text: str) -> None:
-        write_atomic(path, text.encode())
+        write_atomic(self.file, study.model_dump_json(indent=1).encode() + b"\n")
 
     def _show(
         self, reader: DiskReader, shown: dict[str, int], configs: Mapping[str, Config], progress: Progress

@@ -28,7 +28,7 @@ from service.base.parsing import ParseError, parse_with
 from service.config.frozen import FrozenModel
 
 MAX_BYTES = 64 * 1024 * 1024
-"""Greatest size of a run's status, and of its grid of goals."""
+"""Greatest size of a file of JSON in the directory of a run or a study, but for records."""
 STATUS_FILE = "status.json"
 GOALS_FILE = "goals.json"
 STOP_FILE = "stop"
@@ -152,8 +152,7 @@ class RunStatus(FrozenModel):
 
     def vanished(self) -> Self:
         """The status of a silent run that no process runs any more: it must not seem to run for ever."""
-        heard = max(self.heartbeat, datetime.fromtimestamp(0, UTC))  # one of the year 1 may have no date in UTC
-        when = heard.astimezone(UTC).isoformat(timespec="seconds")
+        when = self.heartbeat.astimezone(UTC).isoformat(timespec="seconds")
         error = (
             f"its process vanished without a word, last heard of at {when}; --resume goes on from its last checkpoint"
         )

@@ -14,11 +14,11 @@ from service.base.files import os_errors, read_regular, write_atomic
 from service.base.parsing import ParseError, parse_with
 from service.base.version import __version__
 from service.config.frozen import FrozenModel
+from service.store.models import MAX_BYTES
 
 FILE = "run.json"
 BEFORE = "0.2"
 """The version that reads runs which do not say their version: its own, and those of 0.1, which have no ``run.json``."""
-MAX_BYTES = 16 * 1024 * 1024
 _Note = TypeVar("_Note")
 
 

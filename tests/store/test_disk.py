@@ -229,7 +229,7 @@ def test_a_heartbeat_from_the_future_is_no_sign_of_life(told, lock, clock, monke
 @pytest.mark.parametrize(
     ("heartbeat", "state", "condition", "said"),
     [
-        ("0001-01-01T00:00:00+14:00", "interrupted", "well", "vanished without a word, last heard of at 1970-01-01"),
+        ("0001-01-01T00:00:00+14:00", "interrupted", "well", "cannot be read: date value out of range"),
         ("9999-12-31T23:59:59-14:00", "running", "clock", "s in the future"),
     ],
 )
