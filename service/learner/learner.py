@@ -127,15 +127,16 @@ class Learner:
             A line for each of the four, which says what was taken.
         """
         assert self.version == 0
-        lines, now = [], self._layouts
-        for name, part, before, after in (
-            ("bob/policy", self._bob.policy, seen.bob, now.bob),
-            ("bob/value", self._bob.value, seen.bob_value, now.bob_value),
-            ("alice/policy", self._alice.policy, seen.full, now.full),
-            ("alice/value", self._alice.value, seen.full, now.full),
+        lines = []
+        for name, part, inputs in (
+            ("bob/policy", self._bob.policy, transfer.BOB_INPUTS),
+            ("bob/value", self._bob.value, ("bob_value",)),
+            ("alice/policy", self._alice.policy, ("full",)),
+            ("alice/value", self._alice.value, ("full",)),
         ):
-            given = networks_by_name.get(name)
-            what = "nothing there, begins anew" if given is None else transfer.take_over(part, given, before, after)
+            given, what = networks_by_name.get(name), "nothing there, begins anew"
+            if given is not None:
+                what = transfer.take_over(part, given, seen, self._layouts, inputs)
             lines.append(f"{name}: {what}")
         self._bob_ema = networks.export_parameters(self._bob_policy)
         return lines
