@@ -66,7 +66,6 @@ class Learner:
             bob = networks.make_bob(config.policy, seen), networks.ValueNetwork(seen.bob_value.normalisation, value)
         self._alice = Player(*alice, config.learner.alice, self._device)
         self._bob = Player(*bob, config.learner.bob, self._device)
-        self._bob_policy = bob[0]
         self._mirrored = config.learner.bob.mirror == "random" and config.world.is_symmetric
         self._rng = np.random.Generator(np.random.PCG64(config.seed))
         self._histories = {DEMONSTRATIONS: DemonstrationHistory(config.learner.abc.num_iterations, seen.bob.size)}
@@ -138,7 +137,7 @@ class Learner:
             if given is not None:
                 what = transfer.take_over(part, given, seen, self._layouts, inputs)
             lines.append(f"{name}: {what}")
-        self._bob_ema = networks.export_parameters(self._bob_policy)
+        self._bob_ema = networks.export_parameters(self._bob.policy)
         return lines
 
     def weights(self) -> Weights:
@@ -220,9 +219,9 @@ class Learner:
         )
         metrics |= _prefixed("bob", updated)
         rows = samples if samples is not None else demonstrations
-        if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):
+        if rows is not None and isinstance(bob.policy, networks.MCPPolicy):
             probed = rows.take(probes(len(rows)))
-            metrics |= composition_metrics(self._bob_policy, probed.observation)
+            metrics |= composition_metrics(bob.policy, probed.observation)
         return metrics
 
     def _to_clone(self, name: str, new: Sequence[Demonstrations]) -> DemonstrationRows | None:
