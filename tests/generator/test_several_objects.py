@@ -17,7 +17,6 @@ from service.generator.bins import (
     STACKED,
     GoalCells,
     TaskBins,
-    arrangements,
     highest,
 )
 from service.generator.difficulty import DifficultyGrid, novelty
@@ -73,7 +72,7 @@ def test_arrangements_by_hand():
         moved(np.add(on_second, [0.0, 0.0, 0.011])),  # held above it
         moved(second=START[:3] - START[3:] + [0.0, 0.0, 0.05]),
     ])  # fmt: skip
-    found = arrangements(goals, np.tile(START, (len(goals), 1)), WORLD, 0.05)
+    found = TaskBins(CONFIG, LAYOUT).arrangements(goals, np.tile(START, (len(goals), 1)))
     assert found.tolist() == [ONE_MOVED, SEVERAL_MOVED, STACKED, STACKED, ONE_MOVED, ONE_MOVED, STACKED]
 
 
