@@ -444,14 +444,7 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
 
 
 def learned_policy(parameters: Parameters, trained: Trained | None, config: Config, hold_steps: int) -> LearnedPolicy:
-    """A policy of a task, from what its learner has exported.
-
-    Args:
-        parameters: of the actor.
-        trained: the primitives or skills that it acts with; None: it acts by itself.
-        config: of a run in the world that it was learned in.
-        hold_steps: env steps that an action of the actor lasts.
-    """
+    """A policy of a task, of its actor's parameters, and of what it acts with, learned in the world of ``config``."""
     frozen = None if trained is None else trained.skills if trained.kind == SKILLS else trained.primitives
     return LearnedPolicy(parameters, frozen, layouts(config.world), hold_steps)
 
