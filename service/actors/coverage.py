@@ -7,7 +7,6 @@ A skill of primitives is one gate weight drawn at random and held for a whole ep
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 
@@ -17,22 +16,14 @@ from service.config import WorkspaceConfig, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, each_object
 from service.policies.frozen_skills import FrozenSkills, SkillPlayer
+from service.policies.numpy_policy import NumpyMCPPolicy
 
 NUM_SKILLS = 32
 """Random skills of which coverage is measured, unless told otherwise (paper: 32)."""
 
 
-class Composable(Protocol):
-    """Primitives that compose under given weights."""
-
-    num_primitives: int
-
-    def compose(self, positions: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(N, P) positions and (N, K) weights to the composition's mean and std, (N, 4) each."""
-
-
 class RandomPolicy:
-    """One primitive that acts at random, as a baseline for coverage."""
+    """One primitive that acts at random, as a baseline for coverage; composes as ``NumpyMCPPolicy`` does."""
 
     num_primitives = 1
 
@@ -43,7 +34,13 @@ class RandomPolicy:
 
 
 def skill_trajectories(
-    primitives: Composable, config: WorldConfig, *, num_skills: int, num_steps: int, seed: int, num_threads: int = 0
+    primitives: NumpyMCPPolicy | RandomPolicy,
+    config: WorldConfig,
+    *,
+    num_skills: int,
+    num_steps: int,
+    seed: int,
+    num_threads: int = 0,
 ) -> StateArray:
     """Object positions under random compositions.
 

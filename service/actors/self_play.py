@@ -26,10 +26,9 @@ from service.generator.bins import GoalCells
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import GoalRecords
 from service.generator.ring import Rows
-from service.generator.snapshot import GoalChoice
+from service.generator.snapshot import GeneratorSnapshot, GoalChoice
 from service.generator.validity import Verdict, classify_goal, in_workspace, proposed
 
-VerdictArray = NDArray[np.int8]
 _HINDSIGHT_STRIDE = 4
 """One in so many steps of Bob's failures is a demonstration where Alice gives none to measure them by: about as many as
 in self-play."""
@@ -42,8 +41,6 @@ class StochasticPolicy(Protocol):
         """(N, O) observations to sampled actions (N, A) and log-probabilities (N,)."""
 
 
-ChooseGoals = Callable[[StateArray, StateArray, IntArray, StateArray, VerdictArray], GoalChoice]
-"""Start state, start position, round index, proposal and verdict of a round to Bob's goals (``GeneratorSnapshot``)."""
 SPANNING_SHARE = 0.5
 """Of the goals that may lead from the start of the round before, so many do."""
 Observer = Callable[[StateArray], None]
@@ -134,14 +131,14 @@ class SelfPlay:
         return {"start_state": self.worlds.states.copy(), "start_position": self.worlds.object_position.copy()}
 
     def play_round(
-        self, players: Players, plan: RoundPlan, choose_goals: ChooseGoals, *, observe: Observer | None = None
+        self, players: Players, plan: RoundPlan, snapshot: GeneratorSnapshot, *, observe: Observer | None = None
     ) -> Rollout:
         """Play one round in every world.
 
         Args:
             players: the policies.
             plan: which worlds use a past Alice or Bob.
-            choose_goals: called once, between the two turns.
+            snapshot: chooses Bob's goals, between the two turns.
             observe: records the round, Alice's turn and then Bob's; it changes nothing in the rollout.
         """
         game, worlds = self.config.game, self.worlds
@@ -153,14 +150,23 @@ class SelfPlay:
         verdict = classify_goal(start_position, end_position, self.config.world.workspace, game.success_distance_m)
         verdict[diverged] = Verdict.FALLEN
         spanning = self._spanning(end_position, verdict == Verdict.VALID)
-        keeps = game.goal_rounds > 1
-        this_round = _RoundBefore(alice, start_state.copy(), start_position.copy()) if keeps else None
+        moved_from = start_position.copy()
+        this_round = _RoundBefore(alice, start_state.copy(), moved_from) if game.goal_rounds > 1 else None
         if self._before is not None:
             start_state[spanning] = self._before.start_state[spanning]
             start_position[spanning] = self._before.start_position[spanning]
         self.proposed_from = start_position
         proposal = proposed(start_position, end_position, game.success_distance_m)
-        choice = choose_goals(start_state, start_position, self._round_index - spanning, proposal, verdict)
+        choice = snapshot.choose_goals(
+            plan,
+            start_state,
+            start_position,
+            self._round_index - spanning,
+            proposal,
+            verdict,
+            moved_from=moved_from,
+            rng=self._rng,
+        )
 
         worlds.restore(choice.start_state)
         bob, solved, diverged = self._play_bob(players, plan, choice, observe)
@@ -321,7 +327,7 @@ class SelfPlay:
         self.reached += self.cells.count(self.cells.index(position)[inside])
 
     def _reward_alice(
-        self, alice: Turns, verdict: VerdictArray, tried: BoolArray, solved: BoolArray, novelty: StateArray
+        self, alice: Turns, verdict: NDArray[np.int8], tried: BoolArray, solved: BoolArray, novelty: StateArray
     ) -> None:
         game = self.config.game
         valid = verdict == Verdict.VALID

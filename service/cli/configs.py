@@ -10,7 +10,7 @@ import typer
 from service.base.errors import TandemError, did_you_mean
 from service.base.user_code import parse_reference
 from service.cli.common import CommandGroup, JsonOption, print_json, print_table, task_names
-from service.config.recipes import DEFAULT_RECIPE, find_file, first_comment, recipes, robots
+from service.config.recipes import DEFAULT_RECIPE, first_comment, recipes, robots
 
 configs_app = typer.Typer(name="configs", help="Recipes and robots that come with tandem.", cls=CommandGroup)
 
@@ -53,7 +53,7 @@ def named(what: str | None, method: str | None, primitives: str | None) -> tuple
         )
     if method is not None:
         raise TandemError(f"{what} says its method itself: leave out --method, or change it by --set method={method}")
-    return find_file(what, recipes()), []
+    return recipes().get(what, Path(what)), []
 
 
 @configs_app.callback(invoke_without_command=True)

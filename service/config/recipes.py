@@ -23,11 +23,6 @@ def robots() -> dict[str, Path]:
     return _files("robots")
 
 
-def find_file(named: str, known: dict[str, Path]) -> Path:
-    """The file that was named: the one of that name among the known, else the path as it is."""
-    return known.get(named, Path(named))
-
-
 def first_comment(path: Path) -> str:
     """The sentence at the head of a configuration that says what it is."""
     line = path.read_text(encoding="utf-8").partition("\n")[0]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from service.config.frozen import BUILT_IN, DESCRIBED, FrozenModel
 from service.config.objects import COLORS, Fixture, Object, ObjectWithMass, Obstacle, ObstacleConfig, simple_object
-from service.config.recipes import find_file, robots
+from service.config.recipes import robots
 from service.config.robot import RobotConfig, read_robot
 
 Point = tuple[float, float, float]
@@ -115,7 +116,7 @@ class RandomisationConfig(FrozenModel):
 
 
 def _read_robot(value: Any) -> Any:
-    return read_robot(find_file(value, robots())) if isinstance(value, str) and value != "panda" else value
+    return read_robot(robots().get(value, Path(value))) if isinstance(value, str) and value != "panda" else value
 
 
 Robot = Annotated[

@@ -105,10 +105,6 @@ class ObservationLayout:
         """The same in a world of so many objects."""
         return ObservationLayout(*(entry.of(num_objects) for entry in self.entries))
 
-    def without(self, name: str) -> ObservationLayout:
-        """The others, in their order."""
-        return ObservationLayout(*(entry for entry in self.entries if entry.name != name))
-
     def __getitem__(self, name: str) -> slice:
         """Columns of an entry."""
         return self.columns[name]
@@ -159,7 +155,7 @@ _MOTION = ObservationLayout(
     Entry("contacts", PAIR, "0 or 1", 0.5, 0.5, of_each_object=True),
 )
 _GOAL = ObservationLayout(Entry("goal", VECTOR, "m", _MIDDLE_M, 0.12, of_each_object=True))
-GOAL_FROM_OBJECT = ObservationLayout(Entry("goal_from_object", VECTOR, "m", 0.0, 0.1, of_each_object=True))
+_GOAL_FROM_OBJECT = ObservationLayout(Entry("goal_from_object", VECTOR, "m", 0.0, 0.1, of_each_object=True))
 """Way that each object has to go."""
 _ELAPSED = ObservationLayout(Entry("elapsed", SCALAR, "share of the turn", 0.5, 0.5))
 DELAY = "delay"
@@ -185,7 +181,7 @@ class Layouts:
     def __init__(
         self, num_commands: int = 0, num_obstacles: int = 0, *, delay: bool = False, num_objects: int = 1
     ) -> None:
-        motion, goal, self.way = (each.of(num_objects) for each in (_MOTION, _GOAL, GOAL_FROM_OBJECT))
+        motion, goal, self.way = (each.of(num_objects) for each in (_MOTION, _GOAL, _GOAL_FROM_OBJECT))
         self.num_objects = num_objects
         obstacles = (
             Entry(f"{OBSTACLE_PREFIX}{number + 1}", VECTOR, "m", _MIDDLE_M, 0.12) for number in range(num_obstacles)

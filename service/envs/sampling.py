@@ -240,14 +240,12 @@ def _goals_of(
 
 def _drawn_apart(draw: Callable[[int], StateArray], num: int, config: WorldConfig) -> StateArray:
     """(num, 3 K) goals, each drawn again until its objects ``are_apart``."""
-    goal, near = np.empty((0, 0)), np.ones(num, dtype=bool)
+    goal = draw(num)
     for _ in range(_MAX_DRAWS):
-        drawn = draw(int(near.sum()))
-        goal = drawn if not goal.size else goal
-        goal[near] = drawn
         near = ~are_apart(goal, config)
         if not near.any():
             return goal
+        goal[near] = draw(int(near.sum()))
     raise ConfigError("world.objects: no room in the workspace for goals of all: make world.workspace larger")
 
 

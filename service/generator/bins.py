@@ -55,19 +55,6 @@ NUM_ARRANGEMENTS = 3
 _STACKED_WITHIN_M = 0.01, 0.025
 """Up and sideways, of the place where the middle of one is exactly above the other's."""
 
-
-def arrangements(goals: StateArray, starts: StateArray, world: WorldConfig, success_distance_m: float) -> IntArray:
-    """(M,) arrangement of each of (M, 3 K) goals, beside (M, 3 K) places at the start."""
-    several = (distances(goals, starts) > success_distance_m).sum(axis=1) > 1
-    found: IntArray = np.where(several, SEVERAL_MOVED, ONE_MOVED)
-    place, heights = each_object(goals), np.array(world.rest_heights_m)
-    up_m, sideways_m = _STACKED_WITHIN_M
-    for upper, lower in permutations(range(world.num_objects), 2):
-        way = place[:, upper] - place[:, lower] - [0.0, 0.0, heights[upper] + heights[lower]]
-        found[(np.abs(way[:, 2]) <= up_m) & (np.linalg.norm(way[:, :2], axis=1) <= sideways_m)] = STACKED
-    return found
-
-
 CELL_SIZE_M = 0.05
 """Usual edge of a goal cell."""
 
@@ -153,7 +140,14 @@ class TaskBins:
 
     def arrangements(self, goals: StateArray, starts: StateArray) -> IntArray:
         """(M,) arrangement of each of (M, 3 K) goals, beside (M, 3 K) places at the start."""
-        return arrangements(goals, starts, self.world, self._success_distance_m)
+        several = (distances(goals, starts) > self._success_distance_m).sum(axis=1) > 1
+        found: IntArray = np.where(several, SEVERAL_MOVED, ONE_MOVED)
+        place, heights = each_object(goals), np.array(self.world.rest_heights_m)
+        up_m, sideways_m = _STACKED_WITHIN_M
+        for upper, lower in permutations(range(self.world.num_objects), 2):
+            way = place[:, upper] - place[:, lower] - [0.0, 0.0, heights[upper] + heights[lower]]
+            found[(np.abs(way[:, 2]) <= up_m) & (np.linalg.norm(way[:, :2], axis=1) <= sideways_m)] = STACKED
+        return found
 
     def held(self, states: StateArray) -> BoolArray:
         """(M,) whether in (M, S) states a free gripper holds an object: both fingers touched it."""

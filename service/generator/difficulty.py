@@ -59,9 +59,10 @@ class SuccessCounts:
         vars(self).update({name: np.array(state[name]) for name in vars(self)})
 
 
-def _novelty(proposals: StateArray) -> StateArray:
-    novelty: StateArray = 1.0 / np.sqrt(1.0 + proposals)
-    return novelty
+def novelty(proposals: StateArray) -> StateArray:
+    """How rare proposals are: ``1 / sqrt(1 + n)`` of their decayed counts (as in Bellemare et al. 2016)."""
+    rare: StateArray = 1.0 / np.sqrt(1.0 + proposals)
+    return rare
 
 
 class DifficultyGrid:
@@ -108,14 +109,6 @@ class DifficultyGrid:
         self.arranged = PROPOSAL_DECAY * self.arranged + arranged
         self.counts.record(tries, successes)
         return self.num_cells_seen - before
-
-    def novelty(self) -> StateArray:
-        """(cells,) how rare proposals are: ``1 / sqrt(1 + n)`` of their decayed count (as in Bellemare et al. 2016)."""
-        return _novelty(self.proposals)
-
-    def novelty_of_arrangements(self) -> StateArray:
-        """(arrangements,) the same of arrangements; none of one object."""
-        return _novelty(self.arranged)
 
     def near_reached(self) -> BoolArray:
         """(cells,) whether a cell was reached, or shares a face with one that was."""

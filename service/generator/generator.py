@@ -11,7 +11,7 @@ from service.base.types import Array, Arrays, Metrics
 from service.config.self_play import GeneratorConfig, SelfPlayConfig
 from service.envs.state_layout import StateLayout
 from service.generator.bins import GoalCells, TaskBins
-from service.generator.difficulty import DifficultyGrid, SuccessCounts
+from service.generator.difficulty import DifficultyGrid, SuccessCounts, novelty
 from service.generator.opponents import Opponents
 from service.generator.records import GoalSummary, height_percentile, means
 from service.generator.ring import Ring
@@ -102,8 +102,8 @@ class TaskGenerator:
             starts=self.starts.rows(),
             held_starts=self.held_starts.rows(),
             learnability=self.difficulty.learnability(),
-            novelty=self.grid.novelty() * (1.0 - coverage),
-            novelty_of_arrangements=self.grid.novelty_of_arrangements(),
+            novelty=novelty(self.grid.proposals) * (1.0 - coverage),
+            novelty_of_arrangements=novelty(self.grid.arranged),
             success_rate=np.array(self.grid.mean_success_rate()),
             coverage=np.array(coverage),
             near_reached=self.grid.near_reached(),

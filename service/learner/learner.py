@@ -66,7 +66,6 @@ class Learner:
             bob = networks.make_bob(config.policy, seen), networks.ValueNetwork(seen.bob_value.normalisation, value)
         self._alice = Player(*alice, config.learner.alice, self._device)
         self._bob = Player(*bob, config.learner.bob, self._device)
-        self._bob_policy = bob[0]
         self._mirrored = config.learner.bob.mirror == "random" and config.world.is_symmetric
         self._rng = np.random.Generator(np.random.PCG64(config.seed))
         self._histories = {DEMONSTRATIONS: DemonstrationHistory(config.learner.abc.num_iterations, seen.bob.size)}
@@ -127,17 +126,18 @@ class Learner:
             A line for each of the four, which says what was taken.
         """
         assert self.version == 0
-        lines, now = [], self._layouts
-        for name, part, before, after in (
-            ("bob/policy", self._bob.policy, seen.bob, now.bob),
-            ("bob/value", self._bob.value, seen.bob_value, now.bob_value),
-            ("alice/policy", self._alice.policy, seen.full, now.full),
-            ("alice/value", self._alice.value, seen.full, now.full),
+        lines = []
+        for name, part, inputs in (
+            ("bob/policy", self._bob.policy, transfer.BOB_INPUTS),
+            ("bob/value", self._bob.value, ("bob_value",)),
+            ("alice/policy", self._alice.policy, ("full",)),
+            ("alice/value", self._alice.value, ("full",)),
         ):
-            given = networks_by_name.get(name)
-            what = "nothing there, begins anew" if given is None else transfer.take_over(part, given, before, after)
+            given, what = networks_by_name.get(name), "nothing there, begins anew"
+            if given is not None:
+                what = transfer.take_over(part, given, seen, self._layouts, inputs)
             lines.append(f"{name}: {what}")
-        self._bob_ema = networks.export_parameters(self._bob_policy)
+        self._bob_ema = networks.export_parameters(self._bob.policy)
         return lines
 
     def weights(self) -> Weights:
@@ -219,9 +219,9 @@ class Learner:
         )
         metrics |= _prefixed("bob", updated)
         rows = samples if samples is not None else demonstrations
-        if rows is not None and isinstance(self._bob_policy, networks.MCPPolicy):
+        if rows is not None and isinstance(bob.policy, networks.MCPPolicy):
             probed = rows.take(probes(len(rows)))
-            metrics |= composition_metrics(self._bob_policy, probed.observation)
+            metrics |= composition_metrics(bob.policy, probed.observation)
         return metrics
 
     def _to_clone(self, name: str, new: Sequence[Demonstrations]) -> DemonstrationRows | None:

@@ -161,12 +161,8 @@ class OffPolicyLoop:
         """Env steps made so far, those of uniform actions among them."""
         return self.replay.num_added * self.replay.num_worlds * self.worlds.steps_per_action
 
-    def play(self, num_env_steps: int, on_steps: Callable[[int], None] = lambda num: None) -> Metrics:
+    def play(self, num_env_steps: int) -> Metrics:
         """Make at least so many env steps, with their updates, and average the actor.
-
-        Args:
-            num_env_steps: to be made.
-            on_steps: called with the number of env steps whenever some were made.
 
         Returns:
             Means over the updates; none before learning begins.
@@ -187,7 +183,6 @@ class OffPolicyLoop:
                     size = config.gradient_steps * config.batch_size
                     found.append(self.learner.update(self.make_batch(self.replay, size, self._rng)))
                     self.num_updates += config.gradient_steps
-                on_steps(self.replay.num_worlds * self.worlds.steps_per_action)
         if found:
             self.learner.average_actor()
         return {name: float(np.mean([each[name] for each in found])) for name in (found[0] if found else ())}

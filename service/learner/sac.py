@@ -170,28 +170,21 @@ class SACLearner:
             target = rewards + self.config.gamma * following
         errors = (self.critics(inputs, actions) - target).square()
         critic_loss = 0.5 * (errors.mean(1) if weights is None else errors.mean((1, 2))).sum()
-        self._descend("critics", critic_loss)
+        self._optimizers["critics"].descend(critic_loss)
         mean, log_std = self.actor(inputs)
         new_actions, log_prob = sample_actions(mean, log_std, self._noise(mean))
         values = self.critics(inputs, new_actions)
         values = values if weights is None else (values * weights).sum(-1)
         actor_loss = (alpha * log_prob - values.amin(0)).mean()
-        self._descend("actor", actor_loss)
+        self._optimizers["actor"].descend(actor_loss)
         entropy = -log_prob.detach().mean()
         if self.config.learn_entropy_coefficient:
             target_entropy = self.config.target_entropy * self.num_actions
-            self._descend("alpha", self._log_alpha * (entropy - target_entropy))
+            self._optimizers["alpha"].descend(self._log_alpha * (entropy - target_entropy))
         with torch.no_grad():
             for own, critic in zip(self._targets.parameters(), self.critics.parameters(), strict=True):
                 own.lerp_(critic, self.config.tau)
         return torch.stack((critic_loss.detach(), actor_loss.detach(), alpha, entropy))
-
-    def _descend(self, name: str, loss: Tensor) -> None:
-        """Take a gradient step with these parameters alone: others, through which the loss goes, get no gradient."""
-        parameters = list(self._parameters[name].values())
-        for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
-            parameter.grad = gradient
-        self._optimizers[name].step()
 
     def _noise(self, like: Tensor) -> Tensor:
         return torch.randn(like.shape, generator=self._random)

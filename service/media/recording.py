@@ -10,7 +10,6 @@ import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -232,10 +231,8 @@ def _record(
 ) -> tuple[GoalRecords, list[RecordedRound]]:
     """Play a round in every world and take each world's states and actions out of it."""
     plan = Opponents(0).plan(self_play.worlds.num_worlds, 0.0, rng)  # there are none
-    moved_from = self_play.round_starts()["start_position"]
-    choose_goals = partial(snapshot.choose_goals, plan, moved_from=moved_from, rng=rng)
     states: list[StateArray] = []
-    rollout = self_play.play_round(players, plan, choose_goals, observe=lambda now: states.append(now.copy()))
+    rollout = self_play.play_round(players, plan, snapshot, observe=lambda now: states.append(now.copy()))
     records, alice_steps = rollout.records, int(rollout.alice.active.any(axis=1).sum())
     alice_states, bob_states = np.stack(states[: alice_steps + 1]), np.stack(states[alice_steps + 1 :])
     return records, [

@@ -178,8 +178,8 @@ class Distillation(Method):
                 f"--from {start.reference}: it sees its last {start.world.observed.num_commands} commands, here worlds "
                 f"remember {kept}: raise world.observed.num_commands"
             )
-        before, seen = layouts(start.world).bob, layouts(world).bob
-        said = transfer.take_over(self._distiller.student, dict(start.networks["bob/policy"]), before, seen)
+        before, seen, given = layouts(start.world), layouts(world), start.networks["bob/policy"]
+        said = transfer.take_over(self._distiller.student, given, before, seen, transfer.BOB_INPUTS)
         self._distiller.begin()
         _logger.info("from %s: bob/policy: %s", start.reference, said)
 

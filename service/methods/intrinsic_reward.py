@@ -51,10 +51,7 @@ class IntrinsicReward:
         self.network.train()  # where spectral norms are estimated, this goes on with that
         loss = self.loss(before, after, skill)
         self.network.eval()
-        parameters = list(self.learned().values())
-        for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
-            parameter.grad = gradient
-        self._optimizer.step()
+        self._optimizer.descend(loss)
         return loss.item()
 
     @torch.no_grad()

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from service.actors.coverage import NUM_SKILLS, skill_paths, visited_share
 from service.actors.evaluation import EVALUATION_SEED
 from service.base.errors import ConfigError
 from service.base.tensors import join_parts, split_parts
@@ -27,7 +26,7 @@ from service.methods.method import Iteration, Method, State, goal_grid
 from service.methods.rewards import find_reward
 from service.methods.skill_learning import STATE_SIZE, make_skill_loop
 from service.policies.forward import prepared, relu_layers
-from service.policies.frozen_skills import FrozenSkills, export_skills
+from service.policies.frozen_skills import export_skills
 from service.policies.parameters import Parameters
 from service.registry.loading import Trained
 from service.registry.publishing import measure_skills
@@ -62,16 +61,8 @@ class SkillDiscovery(Method):
 
     def evaluate(self) -> Metrics:
         """Coverage of random skills without noise."""
-        skills = FrozenSkills(self.parameters(), self._skills)
-        paths = skill_paths(
-            skills,
-            self._config.world,
-            num_skills=NUM_SKILLS,
-            num_steps=self._skills.episode_steps,
-            seed=EVALUATION_SEED,
-            num_threads=self._config.run.num_threads,
-        )
-        return {"evaluation/coverage": visited_share(paths, self._config.world.workspace)}
+        found = measure_skills(self._config, self.parameters(), EVALUATION_SEED)
+        return {f"evaluation/{name}": value for name, value in found.items()}
 
     def measure(self) -> Metrics:
         """Coverage of random skills that chose nothing, without noise."""

@@ -35,7 +35,7 @@ from service.methods.task_methods import TaskMethod, find_method
 from service.methods.task_worlds import TaskWorlds, columns
 from service.policies.parameters import Parameters
 from service.registry.learned import learner_inputs, num_inputs
-from service.registry.loading import Trained, load
+from service.registry.loading import Trained, learned_policy, load
 
 _RELABELLED_UNTIL = 0.5
 """Progress from which on the share of relabelled goals is its last one (docs/results/log.md, T17)."""
@@ -96,7 +96,8 @@ class TaskLearning(Method):
 
     def player(self) -> DeterministicPolicy:
         """The policy learned so far, at the start of new episodes."""
-        return self._how.learned(self.parameters(), self._acts_with, self._worlds.steps_per_action)
+        acts_with, config = self._acts_with if self._how.takes else None, self._acts_with.config
+        return learned_policy(self.parameters(), acts_with, config, self._worlds.steps_per_action)
 
     def close(self) -> None:
         """Stop the worlds' threads; a second call does nothing."""

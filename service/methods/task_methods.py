@@ -17,8 +17,7 @@ from service.base.errors import TandemError, did_you_mean
 from service.envs.observations import layouts
 from service.methods.compose import ComposePrimitivesVector, check_primitives, check_robot
 from service.methods.task_worlds import SkillTaskWorlds, TaskWorlds
-from service.policies.parameters import Parameters
-from service.registry.learned import RESIDUAL, Frozen, LearnedPolicy
+from service.registry.learned import RESIDUAL
 from service.registry.loading import Kind, Trained
 
 VectorEnv = gymnasium.vector.VectorEnv[Any, Any, Any]
@@ -65,16 +64,6 @@ class TaskMethod:
         if self.composes:
             env = ComposePrimitivesVector(env, trained, residual=self.residual)
         return TaskWorlds(env, seed, layouts(trained.config.world))
-
-    def frozen(self, trained: Trained) -> Frozen:
-        """What its policy acts with; None: it acts by itself."""
-        if self.takes is None:
-            return None
-        return trained.primitives if self.takes == "primitives" else trained.skills
-
-    def learned(self, parameters: Parameters, trained: Trained, hold_steps: int = 1) -> LearnedPolicy:
-        """The policy of what its learner has exported."""
-        return LearnedPolicy(parameters, self.frozen(trained), layouts(trained.config.world), hold_steps)
 
     def check(self, trained: Trained) -> None:
         """Assert that these primitives or skills are for this method.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -86,9 +85,7 @@ class RolloutWorker:
         self.game.block_grippers(float(snapshot.success_rate))
         starts = self.game.round_starts()
         plan = opponents.plan(self.game.worlds.num_worlds, config.past_opponent_fraction, self.rng)
-        moved_from = starts["start_position"]
-        choose_goals = partial(snapshot.choose_goals, plan, moved_from=moved_from, rng=self.rng)
-        rollout = self.game.play_round(self._players(weights, opponents), plan, choose_goals)
+        rollout = self.game.play_round(self._players(weights, opponents), plan, snapshot)
         goals = summarize(
             rollout.records,
             starts,

@@ -29,6 +29,13 @@ class Adam:
             "step": {name: torch.zeros((), device=each.device) for name, each in parameters.items()},
         }
 
+    def descend(self, loss: Tensor) -> None:
+        """Take a gradient step with these parameters alone: others, through which the loss goes, get no gradient."""
+        parameters = list(self._parameters.values())
+        for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
+            parameter.grad = gradient
+        self.step()
+
     @torch.no_grad()
     def step(self) -> None:
         """Move the parameters that have a gradient; the others and their moments stay."""

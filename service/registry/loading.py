@@ -369,7 +369,7 @@ def _load_version(reference: str, registry: Path | str, primitives: str | None, 
         except KeyError as error:
             raise TandemError(f"{label}: its manifest lacks {error}; publish it again") from None
         trained = _find_frozen(label, name, digest, (registry, primitives))
-        policy = _learned(parameters, trained, trained.config, hold_steps)
+        policy = learned_policy(parameters, trained, trained.config, hold_steps)
         return Trained(
             label, ORCHESTRATOR, trained.config, policy, parameters, manifest, path, trained=trained, **about
         )
@@ -426,7 +426,7 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
         trained = None
         if config.primitives_digest is not None:
             trained = _find_frozen(label, config.primitives, config.primitives_digest, place)
-        policy = _learned(parameters, trained, config, config.hold_steps)
+        policy = learned_policy(parameters, trained, config, config.hold_steps)
         task = find_task(config.task, config.code)
         about: dict[str, Any] = {"task": task, "method": config.method, "trained": trained}
         return Trained(label, ORCHESTRATOR, config, policy, parameters, path=path, **about)
@@ -443,7 +443,8 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
     )
 
 
-def _learned(parameters: Parameters, trained: Trained | None, config: Config, hold_steps: int) -> LearnedPolicy:
+def learned_policy(parameters: Parameters, trained: Trained | None, config: Config, hold_steps: int) -> LearnedPolicy:
+    """A policy of a task, of its actor's parameters, and of what it acts with, learned in the world of ``config``."""
     frozen = None if trained is None else trained.skills if trained.kind == SKILLS else trained.primitives
     return LearnedPolicy(parameters, frozen, layouts(config.world), hold_steps)
 

@@ -50,14 +50,14 @@ def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
     return metrics
 
 
-def measure_skills(config: SkillDiscoveryConfig, parameters: Parameters) -> dict[str, float]:
-    """Share of the workspace's table that random skills move the object over, without noise."""
+def measure_skills(config: SkillDiscoveryConfig, parameters: Parameters, seed: int = REPORTED_SEED) -> dict[str, float]:
+    """Share of the workspace's table that random skills of a seed move the object over, without noise."""
     paths = skill_paths(
         FrozenSkills(parameters, config.skills),
         config.world,
         num_skills=NUM_SKILLS,
         num_steps=config.skills.episode_steps,
-        seed=REPORTED_SEED,
+        seed=seed,
         num_threads=config.run.num_threads,
     )
     return {"coverage": visited_share(paths, config.world.workspace)}

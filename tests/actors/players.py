@@ -116,11 +116,23 @@ def given(goal, own=()):
     return choose
 
 
+class Chooser:
+    """A snapshot whose choice is a function of the round alone; it keeps from where Alice was said to have moved."""
+
+    def __init__(self, choose):
+        self.choose = choose
+
+    def choose_goals(self, plan, *played, moved_from, rng):
+        self.moved_from = moved_from
+        return self.choose(*played)
+
+
 def play(game, alice=None, bob=None, *, plan=None, choose_goals=alices_own, version=0, observe=None, **past):
     """One round; players who are not given do nothing."""
     players = Players(version, alice or Constant(), bob or Constant(), **past)
     plan = plan or everyone_current(game.worlds.num_worlds)
-    return game.play_round(players, plan, choose_goals, observe=observe)
+    chooser = choose_goals if isinstance(choose_goals, Chooser) else Chooser(choose_goals)
+    return game.play_round(players, plan, chooser, observe=observe)
 
 
 def assert_same_rollout(one, other):

@@ -8,7 +8,7 @@ from service.config import parse_config
 from service.envs.observations import distances, each_object
 from service.generator.validity import Verdict
 from service.learner.samples import exchange, exchange_at_random
-from tests.actors.players import Noise, alices_own, assert_same_rollout, given, make_config, play
+from tests.actors.players import Chooser, Noise, alices_own, assert_same_rollout, given, make_config, play
 from tests.runs.runs import TREE, assert_same_run
 from tests.runs.runs import play as run
 
@@ -98,7 +98,9 @@ def test_goals_that_span_two_rounds_lead_from_the_start_of_the_round_before():
     assert (first.records.verdict == Verdict.VALID).all()
     np.testing.assert_allclose(first.records.start_position, np.tile([*RED, *BLUE], (num, 1)))
     slides(game, "object_2", 1.2)  # and the other in the second
-    second = play(game)
+    began, chooser = game.worlds.object_position.copy(), Chooser(alices_own)
+    second = play(game, choose_goals=chooser)
+    np.testing.assert_array_equal(chooser.moved_from, began)
     from_before = distances(second.records.start_position, first.records.start_position).max(axis=1) == 0.0
     assert abs(from_before.mean() - SPANNING_SHARE) < 0.25
     moved = distances(second.records.goal, second.records.start_position) > 0.05

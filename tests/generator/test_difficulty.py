@@ -15,7 +15,7 @@ from service.generator.bins import (
     height_bins,
     in_air,
 )
-from service.generator.difficulty import MEMORY_TRIES, PROPOSAL_DECAY, DifficultyGrid, SuccessCounts
+from service.generator.difficulty import MEMORY_TRIES, PROPOSAL_DECAY, DifficultyGrid, SuccessCounts, novelty
 from service.methods.method import goal_grid
 from tests.generator.outcomes import FREE, SOME_BLOCKED, make_states
 
@@ -156,10 +156,10 @@ def test_novelty_by_hand() -> None:
     often, once, never = grid.cells.index(np.array([goals[0], goals[3], (0.2, 0.0, 0.3)])).ravel()
     proposed, none = grid.cells.count(grid.cells.index(goals)), np.zeros(len(grid.cells), dtype=np.int64)
     grid.record(proposed, none, none, none, ARRANGED)  # tried or not
-    np.testing.assert_allclose(grid.novelty()[[often, once, never]], [1 / 2, 0.5**0.5, 1.0], rtol=1e-15)
+    np.testing.assert_allclose(novelty(grid.proposals)[[often, once, never]], [1 / 2, 0.5**0.5, 1.0], rtol=1e-15)
     grid.record(none, none, none, none, ARRANGED)
     expected = 1.0 / (1.0 + PROPOSAL_DECAY * np.array([3.0, 1.0])) ** 0.5
-    np.testing.assert_allclose(grid.novelty()[[often, once]], expected, rtol=1e-15)
+    np.testing.assert_allclose(novelty(grid.proposals)[[often, once]], expected, rtol=1e-15)
 
 
 def test_height_bins_split_table_from_air() -> None:

@@ -17,10 +17,9 @@ from service.generator.bins import (
     STACKED,
     GoalCells,
     TaskBins,
-    arrangements,
     highest,
 )
-from service.generator.difficulty import DifficultyGrid
+from service.generator.difficulty import DifficultyGrid, novelty
 from service.generator.generator import TaskGenerator
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import of_furthest, summarize
@@ -73,7 +72,7 @@ def test_arrangements_by_hand():
         moved(np.add(on_second, [0.0, 0.0, 0.011])),  # held above it
         moved(second=START[:3] - START[3:] + [0.0, 0.0, 0.05]),
     ])  # fmt: skip
-    found = arrangements(goals, np.tile(START, (len(goals), 1)), WORLD, 0.05)
+    found = TaskBins(CONFIG, LAYOUT).arrangements(goals, np.tile(START, (len(goals), 1)))
     assert found.tolist() == [ONE_MOVED, SEVERAL_MOVED, STACKED, STACKED, ONE_MOVED, ONE_MOVED, STACKED]
 
 
@@ -104,10 +103,10 @@ def test_novelty_of_arrangements_ages_with_proposals():
     grid = DifficultyGrid(GoalCells(WORLD, 0.05))
     none = np.zeros(len(grid.cells), dtype=np.int64)
     grid.record(none, none, none, none, np.array([3, 0, 0]))
-    np.testing.assert_allclose(grid.novelty_of_arrangements(), [0.5, 1.0, 1.0])
+    np.testing.assert_allclose(novelty(grid.arranged), [0.5, 1.0, 1.0])
     copy = DifficultyGrid(grid.cells)
     copy.load_state(grid.state())
-    np.testing.assert_array_equal(copy.novelty_of_arrangements(), grid.novelty_of_arrangements())
+    np.testing.assert_array_equal(novelty(copy.arranged), novelty(grid.arranged))
 
 
 def test_bins_tell_arrangements_apart():

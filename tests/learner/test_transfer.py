@@ -6,7 +6,7 @@ import torch
 
 from service.config.self_play import MCPConfig, MLPConfig, PolicyConfig
 from service.envs.observations import PAPER, Layouts
-from service.learner.transfer import take_over
+from service.learner.transfer import BOB_INPUTS, take_over
 from service.policies import networks
 
 SMALL = PolicyConfig(
@@ -16,10 +16,13 @@ SMALL = PolicyConfig(
 )
 WIDER = Layouts(num_commands=2)
 MAKERS = {
-    "alice": (networks.make_alice, "full"),
-    "alice_value": (lambda config, seen: networks.ValueNetwork(seen.full.normalisation, config.value), "full"),
-    "bob": (networks.make_bob, "bob"),
-    "bob_value": (lambda config, seen: networks.ValueNetwork(seen.bob_value.normalisation, config.value), "bob_value"),
+    "alice": (networks.make_alice, ("full",)),
+    "alice_value": (lambda config, seen: networks.ValueNetwork(seen.full.normalisation, config.value), ("full",)),
+    "bob": (networks.make_bob, BOB_INPUTS),
+    "bob_value": (
+        lambda config, seen: networks.ValueNetwork(seen.bob_value.normalisation, config.value),
+        ("bob_value",),
+    ),
 }
 
 
@@ -41,11 +44,11 @@ def rows_of(layout, entries):
 @pytest.mark.parametrize("name", MAKERS)
 @pytest.mark.parametrize(("before", "after"), [(PAPER, PAPER), (PAPER, WIDER)])
 def test_it_computes_what_the_trained_one_did(name, before, after):
-    make, layout = MAKERS[name]
+    make, inputs = MAKERS[name]
     torch.manual_seed(0)
     trained, new = make(SMALL, before), make(SMALL, after)
-    before_layout, after_layout = getattr(before, layout), getattr(after, layout)
-    said = take_over(new, networks.export_parameters(trained), before_layout, after_layout)
+    before_layout, after_layout = getattr(before, inputs[0]), getattr(after, inputs[0])
+    said = take_over(new, networks.export_parameters(trained), before, after, inputs)
     assert said == ("taken" if before is after else "taken: new command_1, command_2")
     rows = rows_of(before_layout, {})
     wider = rows_of(after_layout, {entry: rows[:, part] for entry, part in before_layout.columns.items()})
@@ -56,15 +59,16 @@ def test_policies_of_two_objects():
     two, wider = Layouts(num_objects=2), Layouts(num_commands=2, num_objects=2)
     torch.manual_seed(0)
     trained = networks.export_parameters(networks.make_bob(SMALL, two))
-    assert take_over(networks.make_bob(SMALL, wider), trained, two.bob, wider.bob) == "taken: new command_1, command_2"
-    said = take_over(networks.make_bob(SMALL, PAPER), trained, two.bob, PAPER.bob)
+    said = take_over(networks.make_bob(SMALL, wider), trained, two, wider, BOB_INPUTS)
+    assert said == "taken: new command_1, command_2"
+    said = take_over(networks.make_bob(SMALL, PAPER), trained, two, PAPER, BOB_INPUTS)
     assert said == "not taken, it was trained with 2 objects, here is 1"
 
 
 def test_inputs_that_are_gone_are_left_out():
     torch.manual_seed(0)
     trained, new = networks.make_bob(SMALL, WIDER), networks.make_bob(SMALL, PAPER)
-    said = take_over(new, networks.export_parameters(trained), WIDER.bob, PAPER.bob)
+    said = take_over(new, networks.export_parameters(trained), WIDER, PAPER, BOB_INPUTS)
     assert said == "taken: left out command_1, command_2"
     rows = rows_of(PAPER.bob, {})
     zero = {"command_1": 0.0, "command_2": 0.0}
@@ -77,10 +81,10 @@ def test_other_sizes_are_not_taken_and_said():
     other = SMALL.model_copy(update={"bob": SMALL.bob.model_copy(update={"num_primitives": 4})})
     new = networks.make_bob(SMALL)
     before = networks.export_parameters(new)
-    said = take_over(new, networks.export_parameters(networks.make_bob(other)), PAPER.bob, PAPER.bob)
+    said = take_over(new, networks.export_parameters(networks.make_bob(other)), PAPER, PAPER, BOB_INPUTS)
     assert said.startswith("not taken, ")
     assert "[4" in said or "[16" in said
     for name, array in networks.export_parameters(new).items():
         np.testing.assert_array_equal(array, before[name])
     monolithic = networks.export_parameters(networks.make_alice(SMALL))
-    assert "parameters are not in both" in take_over(new, monolithic, PAPER.bob, PAPER.bob)
+    assert "parameters are not in both" in take_over(new, monolithic, PAPER, PAPER, BOB_INPUTS)

@@ -14,7 +14,7 @@ from service.envs.batch import WorldBatch
 from service.envs.observations import PAPER, POSITIONS, layouts
 from service.envs.sampling import inside_obstacles
 from service.learner.distillation import Distiller
-from service.learner.transfer import take_over
+from service.learner.transfer import BOB_INPUTS, take_over
 from service.policies import networks
 from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
 from service.registry.loading import Trained, load
@@ -42,7 +42,7 @@ def make_teacher(config, seed=0):
 def make_student(config, teacher):
     student = networks.make_bob(config.policy, layouts(config.world))
     parameters = networks.export_parameters(teacher)
-    take_over(student, parameters, PAPER.bob, layouts(config.world).bob)
+    take_over(student, parameters, PAPER, layouts(config.world), BOB_INPUTS)
     return student, NumpyMCPPolicy(parameters)
 
 

@@ -73,9 +73,10 @@ def test_updates_and_horizon_are_counted_in_env_steps(skills):
 
 
 def test_a_learned_policy_holds_its_skills(skills):
-    loop = TaskLearning(small_trial("lsd", skill_steps=5), skills).loop
+    training = TaskLearning(small_trial("lsd", skill_steps=5), skills)
+    loop = training.loop
     loop.play(200)  # learned nothing yet: the average is the actor
-    player = METHODS["lsd"].learned(loop.learner.averaged_parameters(), skills, 5)
+    player = training.player()
     worlds = SkillTaskWorlds(loop.worlds.env, 3, skills.skills, 5)
     handed, step = [], worlds.env.step
 

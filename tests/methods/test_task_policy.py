@@ -2,20 +2,18 @@ import numpy as np
 import pytest
 import torch
 
-from service.envs.observations import layouts
 from service.methods.task import TaskLearning
 from service.methods.task_methods import METHODS
-from service.registry.learned import LearnedPolicy
 from tests.methods.trials import small_trial
 
 
 @pytest.mark.parametrize("method", ["ours", "ours-residual-her", "scratch-monolithic", "scratch-mcp-her"])
 def test_a_learned_policy_acts_as_in_its_worlds(champion, method):
     """Evaluation goes another way than learning, from Bob's input to actions; a loaded policy does the same."""
-    loop = TaskLearning(small_trial(method).begin("no registry here", None), champion).loop
+    training = TaskLearning(small_trial(method).begin("no registry here", None), champion)
+    loop = training.loop
     loop.play(400)
-    parameters, seen = loop.learner.averaged_parameters(), layouts(champion.config.world)
-    player = LearnedPolicy(parameters, METHODS[method].frozen(champion), seen)
+    player = training.player()
     inner = loop.worlds.env.env if METHODS[method].composes else loop.worlds.env
     handed, step = [], inner.step
     inner.step = lambda actions: handed.append(actions) or step(actions)
@@ -28,6 +26,5 @@ def test_a_learned_policy_acts_as_in_its_worlds(champion, method):
         rows = np.concatenate((columns["positions"], columns["goal"]), axis=1)
         np.testing.assert_allclose(player.act_deterministic(rows), handed[-1], rtol=0, atol=1e-5)
     player.begin()
-    fresh = METHODS[method].learned(parameters, champion)
-    np.testing.assert_array_equal(player.act_deterministic(rows), fresh.act_deterministic(rows))
+    np.testing.assert_array_equal(player.act_deterministic(rows), training.player().act_deterministic(rows))
     loop.worlds.close()
