@@ -7,9 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
+import numpy as np
 import typer
 
 from service.base.errors import TandemError, in_metres, one_line
+from service.base.files import write_atomic
 from service.cli.common import (
     SOURCE,
     ActsWithOption,
@@ -24,13 +26,17 @@ from service.cli.common import (
     print_json,
     what_is_meant,
 )
+from service.config import WorldConfig, changed_config
+from service.config.find import METHODS
+from service.envs.observations import each_object, layouts
+from service.generator.validity import in_workspace
+from service.store.run_directory import encode_result
 
 if TYPE_CHECKING:
     from pydantic import JsonValue
 
     from service.actors.evaluation import DeterministicPolicy
     from service.base.types import Metrics, StateArray
-    from service.config import WorldConfig
     from service.envs.sampling import GoalKind
     from service.media.video import FilmOptions
     from service.registry.loading import Trained
@@ -92,8 +98,6 @@ def evaluate(
     reference, primitives = what_is_meant(reference, primitives)
     with loading():
         from service.actors.evaluation import evaluate as run
-        from service.config import changed_config
-        from service.envs.observations import layouts
         from service.envs.sampling import GOAL_KINDS
         from service.methods.task_evaluation import FINAL_SEED, numbers_of
         from service.registry.loading import load
@@ -150,7 +154,6 @@ def evaluate(
 def _players(trained: Trained, method: str | None) -> dict[str, DeterministicPolicy]:
     """The policies that are measured, by name."""
     from service.actors.evaluation import IdlePolicy
-    from service.config.find import METHODS
     from service.methods.task_methods import find_method
 
     players: dict[str, DeterministicPolicy] = {}
@@ -168,12 +171,10 @@ def _players(trained: Trained, method: str | None) -> dict[str, DeterministicPol
 
 def _write_result(path: Path, trained: Trained, method: str | None, seed: int, numbers: Metrics) -> None:
     """Write a file that says what a run's configuration and result say."""
-    from service.base.files import write_atomic
-    from service.methods.task_methods import METHODS
-    from service.store.run_directory import encode_result
+    from service.methods.task_methods import METHODS as OF_TASKS
 
     method = method or ("asp-only" if trained.kind == "primitives" else f"{trained.skills.method}-zero-shot")
-    takes = method not in METHODS or METHODS[method].takes is not None
+    takes = method not in OF_TASKS or OF_TASKS[method].takes is not None
     result: dict[str, JsonValue] = {
         "task": None if trained.task is None else trained.task.name,
         "method": method,
@@ -286,11 +287,7 @@ def parse_goals(text: str, world: WorldConfig) -> GoalKind | StateArray:
     Raises:
         TandemError: neither; or a goal outside of the workspace, or inside a fixture.
     """
-    import numpy as np
-
-    from service.envs.observations import each_object
     from service.envs.sampling import GOAL_KINDS, check_goals, inside_fixtures
-    from service.generator.validity import in_workspace
 
     for kind in GOAL_KINDS:
         if text.strip() == kind:

@@ -9,12 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from pydantic import ValidationError
 
 from service.base.errors import TandemError, in_metres
+from service.base.types import StateArray
 from service.cli.common import CHAMPION, REFERENCE, SOURCE, CommandGroup, SourceOption, print_json
+from service.config.frozen import first_error
+from service.config.tree import apply_override
+from service.runs.signals import StopSignals
 
 if TYPE_CHECKING:
-    from service.base.types import StateArray
     from service.registry.loading import Trained
     from service.robot.backends import Backend, BackendConfig
     from service.robot.limits import Box
@@ -147,10 +151,6 @@ def replay(
 
 
 def _bridge_config(overrides: list[str] | None) -> BridgeConfig:
-    from pydantic import ValidationError
-
-    from service.config.frozen import first_error
-    from service.config.tree import apply_override
     from service.robot.loop import BridgeConfig
 
     tree: dict[str, Any] = {}
@@ -180,7 +180,6 @@ def _connected(
     from service.robot.backends import connect
     from service.robot.safety import always_held
     from service.robot.watchdogs import HeldKey
-    from service.runs.signals import StopSignals
 
     if dead_man not in (None, "key", "none"):
         raise TandemError(f"--dead-man {dead_man!r}: choose key or none")
