@@ -14,8 +14,10 @@ from pydantic import ValidationError
 from service.base.errors import TandemError, in_metres
 from service.base.types import StateArray
 from service.cli.common import CHAMPION, REFERENCE, SOURCE, CommandGroup, SourceOption, print_json
+from service.cli.evaluate import parse_points
 from service.config.frozen import first_error
 from service.config.tree import apply_override
+from service.config.world import WorldConfig
 from service.runs.signals import StopSignals
 
 if TYPE_CHECKING:
@@ -62,7 +64,7 @@ def run(
     from service.robot.backends import read_backend
     from service.robot.calibrate import read_calibration
     from service.robot.loop import Bridge
-    from service.robot.running import RobotLog, parse_goal, play
+    from service.robot.running import RobotLog, play
 
     config, described, player = _bridge_config(overrides), read_backend(robot), _load(policy, registry)
     goal_m = None if goal is None else parse_goal(goal, player.world)
@@ -148,6 +150,19 @@ def replay(
     world, recorded = read_log(log)
     write_episode_video(recorded, world, out)
     typer.echo(f"video: {out}")
+
+
+def parse_goal(text: str, world: WorldConfig) -> StateArray:
+    """(3,) a goal of a robot in metres, no lower than where the object lies on the table.
+
+    Raises:
+        TandemError: another goal, or several; or as for ``parse_points``.
+    """
+    goals = parse_points("--goal", text, world, "a point")
+    if len(goals) > 1 or goals[0, 2] < round(world.rest_height_m, 6):
+        raise TandemError(f"--goal {text}: write one point, no lower than the object lies, {world.rest_height_m:.3f} m")
+    goal: StateArray = goals[0]
+    return goal
 
 
 def _bridge_config(overrides: list[str] | None) -> BridgeConfig:

@@ -19,17 +19,15 @@ from service.base.types import StateArray
 from service.config.frozen import first_error
 from service.config.world import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.sampling import Places, draw_goals, draw_objects, inside_fixtures
+from service.envs.sampling import Places, draw_goals, draw_objects
 from service.media.recording import RecordedEpisodes
 from service.methods.compose import check_robot
 from service.registry.loading import Trained
 from service.robot.backends import Backend
-from service.robot.limits import Box
 from service.robot.loop import Bridge
 
 FORMAT_VERSION = 1
 """Of a log."""
-_ROUNDING_M = 1e-6
 _LONG_WAY = 30
 """Iterations that find the arm's joints from its home."""
 
@@ -58,28 +56,6 @@ def for_robot(trained: Trained) -> Trained:
     if found.world.num_observed_obstacles:
         raise TandemError(f"{found.label} observes obstacles, and the bridge measures the object alone; train without")
     return found
-
-
-def parse_goal(text: str, world: WorldConfig) -> StateArray:
-    """(3,) a goal written as ``x,y,z``, metres.
-
-    Raises:
-        TandemError: no three numbers, outside the box of training, or where the object would be inside a fixture.
-    """
-    try:
-        goal = np.array([float(part) for part in text.split(",")])
-    except ValueError:
-        goal = np.empty(0)
-    if goal.shape != (3,) or not np.isfinite(goal).all():
-        raise TandemError(f"--goal {text!r}: expected x,y,z in metres, such as -0.05,0.1,0.2")
-    lower, upper = np.array(world.workspace.lower_m), np.array(world.workspace.upper_m)
-    lower[2] = world.rest_height_m
-    box = Box(lower, upper)
-    if not box.contains(goal, margin_m=_ROUNDING_M):
-        raise TandemError(f"--goal {text}: outside the box that the policy was trained in: {box}")
-    if inside_fixtures(goal[None], world)[0]:
-        raise TandemError(f"--goal {text}: the object would be inside a fixture, or the upright box around it")
-    return goal
 
 
 def play(

@@ -374,7 +374,7 @@ def test_render_films_goals_that_are_typed(trained, monkeypatch, tmp_path):
     ("arguments", "part"),
     [
         (["--goals", "lift"], "--goals 'lift': write one of table, air, mixed, volume, one, or points"),
-        (["--goals", "0.1,nan,0.2"], "or points x,y,z in metres"),
+        (["--goals", "0.1,nan,0.2"], "or points with ; between, each x,y,z in metres"),
         (["--goals", "0.1,0,0.2;0.9,0,0.1"], "0.900, 0.000, 0.100 is outside of the workspace"),
         (["--size", "641x360"], "--size '641x360': write WIDTHxHEIGHT, even numbers"),
         (["--camera", "moon"], "camera 'moon': there is none"),

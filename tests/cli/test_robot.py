@@ -15,12 +15,13 @@ from typer.testing import CliRunner
 from service.base.errors import RobotError, TandemError
 from service.base.jsonl import read_jsonl
 from service.cli.main import app
+from service.cli.robot import parse_goal
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
 from service.registry.loading import Trained
 from service.robot.backends import Backend
 from service.robot.loop import Bridge, BridgeConfig
-from service.robot.running import parse_goal, play, read_log
+from service.robot.running import play, read_log
 from tests.robot.fakes import FakeRobot, Steady
 
 FAST = ["--set", "set_points_per_step=2"]
@@ -93,8 +94,10 @@ def test_what_calibrate_writes_run_reads(tmp_path):
     ("arguments", "match"),
     [
         (["--robot", "armm"], "unknown robot 'armm'"),
-        (["--robot", "mujoco", "--goal", "1,2,3"], "outside the box that the policy was trained in: x -0.225 to 0.125"),
-        (["--robot", "mujoco", "--goal", "here"], "expected x,y,z in metres"),
+        (["--robot", "mujoco", "--goal", "1,2,3"], "--goal: 1.000, 2.000, 3.000 is outside of the workspace"),
+        (["--robot", "mujoco", "--goal", "here"], "--goal 'here': write a point x,y,z in metres\n"),
+        (["--robot", "mujoco", "--goal", "0,0,0.02"], "--goal 0,0,0.02: write one point, no lower than"),
+        (["--robot", "mujoco", "--goal", "0,0,0.2;0,0,0.1"], "0,0,0.1: write one point"),
         (["--robot", "mujoco", "--policy", "nobody@1"], "nobody"),
         (["--robot", "mujoco", "--set", "safety.max_speed=1"], "--set: unknown key 'safety.max_speed'"),
         (["--robot", "mujoco", "--set", "safety.lowest_m=0.49"], "safety: the box .* is empty"),
@@ -112,9 +115,9 @@ def test_what_cannot_be_run_is_one_line(arguments, match):
 
 def test_a_goal_inside_the_wall_is_refused_and_one_behind_it_is_not():
     wall = WorldConfig(fixture="wall")
-    with pytest.raises(TandemError, match=r"^--goal -0.05,0,0.025: the object would be inside a fixture"):
+    with pytest.raises(TandemError, match=r"^--goal: at -0\.050, 0\.000, 0\.025 the object would be inside a fixture"):
         parse_goal("-0.05,0,0.025", wall)
-    np.testing.assert_array_equal(parse_goal("0.05,0,0.025", wall), [0.05, 0.0, 0.025])
+    np.testing.assert_array_equal(parse_goal("0.125,0,0.025", wall), [0.125, 0.0, 0.025])  # at the very edge
 
 
 def test_a_robot_that_cannot_know_where_the_box_is_wants_a_goal():
