@@ -311,20 +311,6 @@ def load(
     return found
 
 
-def read_stages(directory: RunDirectory) -> dict[int, Parameters]:
-    """Parameters of Bob, or of skills, in a run's snapshots and its newest checkpoint, by env steps, in their order.
-
-    Raises:
-        TandemError: a snapshot is damaged, or there is no usable checkpoint.
-    """
-    part = directory.read_config().part
-    store = CheckpointStore(directory.snapshots, keep=1)
-    saved = [read_checkpoint(store.path(step)) for step in store.steps()]
-    saved.append(CheckpointStore(directory.checkpoints, keep=1).load_latest())
-    stages = {int(each.meta["env_steps"]): split_parts(each.arrays)[part] for each in saved}
-    return dict(sorted(stages.items()))  # a killed run may have a snapshot that is newer than its checkpoint
-
-
 def _task_of(spaces: Mapping[str, Any], manifest: Manifest, label: str, *, run_code: bool) -> Task:
     """The task of a published policy: a user's own without its functions, unless its code may run.
 
