@@ -21,7 +21,6 @@ from service.policies.numpy_policy import numpy_bob
 from service.policies.parameters import Parameters
 from service.registry.bundled import BUNDLED, find_version
 from service.registry.learned import num_inputs
-from service.registry.loading import ORCHESTRATOR, PRIMITIVES, SKILLS
 from service.registry.names import Version, is_service
 from service.registry.registry import Registry, sha256_of
 from service.store.run_directory import Published, RunDirectory
@@ -126,9 +125,9 @@ def check_publishable(config: Config, registry: Path | str) -> None:
     for place in (target, Registry(BUNDLED)):  # of either, NAME@latest would come to mean something else
         for version in place.versions(config.name)[-1:]:
             with contextlib.suppress(StorageError):  # a damaged version is mended by publishing again
-                kind = place.manifest(str(version)).spaces.get("kind", PRIMITIVES)
+                kind = place.manifest(str(version)).spaces.get("kind", "primitives")
                 if config.makes not in (None, kind):
-                    what = f"an {kind}" if kind == ORCHESTRATOR else kind
+                    what = f"an {kind}" if kind == "orchestrator" else kind
                     raise TandemError(f"{config.name} is the name of {what} already: choose another name")
     if not isinstance(config, TaskConfig):
         return
@@ -147,7 +146,7 @@ def _described(config: Config) -> dict[str, Any]:
     if isinstance(config, TaskConfig):
         spaces = {
             **seen.spaces,
-            "kind": ORCHESTRATOR,
+            "kind": "orchestrator",
             "task": config.task,
             "task_version": config.task_version,
             "method": config.method,
@@ -163,7 +162,7 @@ def _described(config: Config) -> dict[str, Any]:
         }
     if isinstance(config, SkillDiscoveryConfig):
         shared = {name: size for name, size in SPACES.items() if name != "observation"}
-        normalisation, spaces = POSITIONS.normalisation, {**shared, "kind": SKILLS, "skill": config.skills.size}
+        normalisation, spaces = POSITIONS.normalisation, {**shared, "kind": "skills", "skill": config.skills.size}
     else:
         normalisation, spaces = seen.bob.normalisation, seen.spaces
     constants = {"offset": normalisation.offset.tolist(), "scale": normalisation.scale.tolist()}
