@@ -73,11 +73,11 @@ def publish_run(
     Raises:
         StorageError: see ``Registry.publish``; or the run directory cannot be written.
     """
-    version, parent = newest_if_same(registry, config.name, parameters), None
-    if version is None:
-        parent = _published_before(directory, registry)
-        if parent is not None and parent.name == config.name and _has(registry, parent, parameters):
-            version = parent  # others have published under this name since
+    parent = _published_before(directory, registry)
+    candidates = registry.versions(config.name)[-1:]
+    if parent is not None and parent.name == config.name:
+        candidates.append(parent)  # others may have published under this name since
+    version = next((each for each in candidates if _has(registry, each, parameters)), None)
     if version is None:
         known = directory.history
         history = known.model_dump(mode="json") if known is not None and known.events else None
@@ -167,12 +167,6 @@ def _described(config: Config) -> dict[str, Any]:
         normalisation, spaces = seen.bob.normalisation, seen.spaces
     constants = {"offset": normalisation.offset.tolist(), "scale": normalisation.scale.tolist()}
     return {"spaces": spaces, "normalisation": constants}
-
-
-def newest_if_same(registry: Registry, name: str, parameters: Parameters) -> Version | None:
-    """The newest version, if it has these parameters: what is published again must not become another version."""
-    newest = registry.versions(name)[-1:]
-    return newest[0] if newest and _has(registry, newest[0], parameters) else None
 
 
 def _has(registry: Registry, version: Version, parameters: Parameters) -> bool:
