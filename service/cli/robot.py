@@ -64,7 +64,7 @@ def run(
     from service.robot.backends import read_backend
     from service.robot.calibrate import read_calibration
     from service.robot.loop import Bridge
-    from service.robot.running import RobotLog, play
+    from service.robot.running import open_log, play
 
     config, described, player = _bridge_config(overrides), read_backend(robot), _load(policy, registry)
     goal_m = None if goal is None else parse_goal(goal, player.world)
@@ -77,13 +77,11 @@ def run(
 
         def record(row: dict[str, Any]) -> None:
             if written is not None:
-                written.record(row)
+                written.append({"episode": len(outcomes), **row})
             if dry_run:
                 _print_step(row, bridge.safe.limiter.box, to_stderr=as_json)
 
         def ready(episode: int, goal_m: StateArray) -> None:
-            if written is not None:
-                written.episode = episode
             wait(f"goal {episode + 1} of {episodes}, {in_metres(goal_m)}: put arm and object to their start")
 
         bridge = Bridge(
@@ -97,7 +95,7 @@ def run(
             "bridge": config.model_dump(mode="json"),
             "calibration": None if calibration is None else str(calibration),
         }
-        written = None if log is None else RobotLog(log, header, player.world)
+        written = None if log is None else open_log(log, header, player.world)
         outcomes = []
         for outcome in play(
             bridge, backend, player, goal_m=goal_m, num_episodes=episodes, num_steps=steps, seed=seed, ready=ready

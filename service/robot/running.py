@@ -118,8 +118,8 @@ def _goal_from(backend: Backend, rng: np.random.Generator, policy: Trained) -> S
 # --- the log ---------------------------------------------------------------------------------------------------------
 
 
-class RobotLog:
-    """Writes a log.
+def open_log(path: Path, header: Mapping[str, Any], world: WorldConfig) -> JsonlWriter:
+    """Begin a log, to which steps are appended as ``loop.Bridge.run`` has them, each with its ``episode``.
 
     Args:
         path: a file that is not there yet.
@@ -129,18 +129,11 @@ class RobotLog:
     Raises:
         TandemError: the file is there, or cannot be written.
     """
-
-    def __init__(self, path: Path, header: Mapping[str, Any], world: WorldConfig) -> None:
-        if path.exists():
-            raise TandemError(f"--log {path}: there is a file already; name another")
-        self._writer = JsonlWriter(path)
-        self._writer.append({"format_version": FORMAT_VERSION, **header, "world": world.model_dump(mode="json")})
-        self.episode = 0
-        """Number that steps are logged under."""
-
-    def record(self, row: Mapping[str, Any]) -> None:
-        """Add a step; see ``loop.Bridge.run``."""
-        self._writer.append({"episode": self.episode, **row})
+    if path.exists():
+        raise TandemError(f"--log {path}: there is a file already; name another")
+    log = JsonlWriter(path)
+    log.append({"format_version": FORMAT_VERSION, **header, "world": world.model_dump(mode="json")})
+    return log
 
 
 def read_log(path: Path) -> tuple[WorldConfig, RecordedEpisodes]:
