@@ -242,7 +242,8 @@ def _smooth(values: StateArray, span: float) -> StateArray:
     """The exponential moving average with Adam's correction for its start, so the first value is not favoured."""
     decay = 1.0 - 2.0 / (span + 1.0)
     averages = accumulate((1.0 - decay) * values, lambda average, value: decay * average + value)
-    return np.array(list(averages)) / (1.0 - decay ** np.arange(1, len(values) + 1))
+    smoothed: StateArray = np.array(list(averages)) / (1.0 - decay ** np.arange(1, len(values) + 1))
+    return smoothed
 
 
 def _draw_panel(axes: Axes, panel: _Panel, curves: Sequence[tuple[_Curve, Sequence[dict[str, Any]]]]) -> None:
