@@ -11,7 +11,6 @@ from typing import Annotated
 import typer
 
 from service.base.errors import StatusError, needs_extra
-from service.base.ports import DEFAULT_PORT, free_port
 from service.cli.common import (
     REGISTRY,
     SOURCE,
@@ -44,6 +43,7 @@ def serve(
     quiet: QuietOption = False,
 ) -> None:
     """Show finished and running runs and the registry over REST, to Prometheus, and to a browser."""
+    from service.base.ports import DEFAULT_PORT, free_port
     from service.status.run_reader import open_reader
 
     with needs_extra("serve", "tandem serve"):

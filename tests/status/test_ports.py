@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import pytest
 from typer.testing import CliRunner
 
-from service.base.ports import DEFAULT_PORT, free_port
+from service.base.ports import DEFAULT_PORT, free_port, url_of
 from service.cli.main import app
 from service.cluster.ray_connection import StatusOptions, parse_status
 from service.cluster.status_actor import place
@@ -40,6 +40,12 @@ def test_the_next_free_port():
     assert free_port("::1") > 1023
     with pytest.raises(OSError, match="no name of a host"):
         free_port("127.0.0..1")
+
+
+def test_a_url_leads_to_what_listens_at_all_addresses():
+    assert url_of("lab", 8321) == "http://lab:8321"
+    assert [url_of(host, 1) for host in ("", "0.0.0.0")] == ["http://127.0.0.1:1"] * 2
+    assert [url_of(host, 1) for host in ("::", "::1")] == ["http://[::1]:1"] * 2
 
 
 def test_serve_takes_the_next_one_unless_told_which(tmp_path, monkeypatch, busy, caplog):
