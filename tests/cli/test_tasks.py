@@ -5,15 +5,14 @@ import os
 import signal
 
 import pytest
-from typer.testing import CliRunner
 
 from service.base.lock import DirectoryLock
-from service.cli.main import app
 from service.config.find import METHODS
 from service.registry.bundled import BUNDLED
 from service.registry.registry import Registry
 from service.store.models import read_status
 from service.store.run_directory import RunDirectory
+from tests.cli.typed import assert_refused, tandem
 from tests.runs.runs import play
 
 CHAMPION = str(Registry(BUNDLED).resolve("panda-cube@champion"))
@@ -25,17 +24,6 @@ SETS = [
     )
 ]
 """Three iterations of 200 env steps; the second and third learn."""
-
-
-def tandem(*arguments):
-    return CliRunner().invoke(app, list(map(str, arguments)))
-
-
-def assert_refused(result, words):
-    assert result.exit_code == 2, result.exception
-    assert result.stderr.startswith("error: ")
-    assert result.stderr.count("\n") == 1, result.stderr
-    assert words in result.stderr, result.stderr
 
 
 @pytest.fixture(autouse=True)
@@ -203,9 +191,5 @@ def test_methods_and_tasks_are_listed():
     ],
 )
 def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, arguments, words):
-    refused = tandem("train", *arguments)
-    assert refused.exit_code in (1, 2)
-    assert refused.stderr.startswith("error: ")
-    assert refused.stderr.count("\n") == 1
-    assert words in refused.stderr
+    assert_refused(tandem("train", *arguments), words)
     assert list(tmp_path.iterdir()) == []

@@ -4,12 +4,11 @@ import socket
 from contextlib import contextmanager
 
 import pytest
-from typer.testing import CliRunner
 
 from service.base.ports import DEFAULT_PORT, free_port, url_of
-from service.cli.main import app
 from service.cluster.ray_connection import StatusOptions, parse_status
 from service.cluster.status_actor import place
+from tests.cli.typed import assert_refused, tandem
 
 
 @contextmanager
@@ -53,14 +52,12 @@ def test_serve_takes_the_next_one_unless_told_which(tmp_path, monkeypatch, busy,
     (tmp_path / "runs").mkdir()
     monkeypatch.setattr("service.status.server.StatusServer.run", lambda server: server.stop())
     with caplog.at_level("INFO"):
-        result = CliRunner().invoke(app, ["serve"])
+        result = tandem("serve")
     assert result.exit_code == 0, result.output
     chosen = int(result.stdout.splitlines()[0].rpartition(":")[2])
     assert busy < chosen < busy + 50
     assert f"port {busy} is taken, so this is at port {chosen}" in caplog.messages
-    told = CliRunner().invoke(app, ["serve", "--port", str(busy)])
-    assert told.exit_code == 2
-    assert f"port {busy} of 127.0.0.1 is taken" in told.stderr
+    assert_refused(tandem("serve", "--port", busy), f"port {busy} of 127.0.0.1 is taken")
 
 
 def test_a_run_on_ray_does_the_same(caplog):
