@@ -384,7 +384,6 @@ def test_a_goal_of_a_film_is_in_no_fixture():
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        (["--set", "learner.bob.num_epoch=3"], ["learner.bob.num_epoch", "num_epochs"]),
         (["--set", "game.num_worlds=0"], ["game.num_worlds", "0"]),
         (["--set", "world.object=bunny"], ["world.object", "bunny"]),
         (["--set", "name=No Name"], ["name", "No Name"]),
@@ -420,11 +419,7 @@ def test_a_resume_without_a_checkpoint(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        (["evaluate", "tiny@best"], ["no alias 'best'", "latest -> 1"]),
-        (["evaluate", "tiny@2"], ["no version 2"]),
-        (["evaluate", "nobody"], ["no 'nobody'", "it holds: tiny", "with tandem comes: panda-cube"]),
         (["evaluate", "no/where"], ["no/where", "no such directory of a run"]),
-        (["evaluate", "tiny", "--goals", "sky"], ["'sky'", "table, air, mixed"]),
         (["coverage", "tiny", "--skills", "2", "--steps", "1", "--out", "file/x.png"], ["file/x.png"]),
         (["coverage", "tiny", "--out", "x.txt"], ["--out x.txt", "ends in .png"]),
     ],

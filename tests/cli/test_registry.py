@@ -108,11 +108,6 @@ def test_alias(run: Run, registry: Registry) -> None:
     assert registry.aliases("panda-cube") == {"champion": 1, "latest": 2}
 
 
-def test_export(run: Run, tmp_path: Path) -> None:
-    assert run("export", "panda-cube@1", str(tmp_path / "out")).exit_code == 0
-    assert parse_manifest((tmp_path / "out" / "manifest.json").read_bytes(), tmp_path).version == 1
-
-
 def test_what_is_exported_is_a_version_for_every_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TANDEM_REGISTRY", "none")
