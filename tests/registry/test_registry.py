@@ -337,17 +337,6 @@ def test_export_is_read_back_without_the_registry(registry: Registry, publish: P
         registry.export("panda-cube", target)
 
 
-def test_a_registry_that_is_marked_as_only_read_is_not_written(registry: Registry, publish: Publish) -> None:
-    publish()
-    (registry.root / "READ_ONLY").touch()
-    before = files_in(registry.root)
-    for write in (publish, lambda: registry.set_alias("panda-cube", "best", 1)):
-        with pytest.raises(RegistryError, match=r"cannot write .*: this registry is only read; name another directory"):
-            write()
-    assert files_in(registry.root) == before
-    assert registry.manifest("panda-cube").version == 1
-
-
 def test_a_registry_that_cannot_be_one_is_refused_before_anything_is_learned(tmp_path: Path) -> None:
     file = tmp_path / "learn.yaml"
     file.touch()
