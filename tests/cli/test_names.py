@@ -76,10 +76,7 @@ def test_configs_are_listed_and_shown():
         (["pretrain", "--set", "learner.gae_lambda=0.9"], "mean learner.alice.gae_lambda or learner.bob.gae_lambda?"),
         (["pretrain", "--method", "LSDD"], "did you mean 'lsd'?"),
         (["pretrain", "--runtime", "rai"], "did you mean 'ray'?"),
-        (
-            ["evaluate", "panda-cube", "--goals", "tabel"],
-            "choose one of table, air, mixed, volume, one; did you mean 'table'?",
-        ),
+        (["evaluate", "panda-cube", "--goals", "tabel"], "table, air, mixed, volume, one; did you mean 'table'?"),
         (["evaluate", "panda-cube@champoin"], "did you mean 'champion'?"),
         (["train", "walls"], "did you mean 'wall'?"),
         (["train", "wall", "--method", "ours_her"], "did you mean 'ours-her'?"),

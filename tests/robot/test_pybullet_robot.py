@@ -39,7 +39,7 @@ def test_it_starts_as_our_worlds_do_in_our_frame(robot):
     np.testing.assert_allclose(state.effector_m, [workspace.center_x_m, workspace.center_y_m, 0.08], atol=1e-3)
     np.testing.assert_allclose(state.fingers_m, [0.04, 0.04], atol=1e-4)
     np.testing.assert_allclose(ExactPoses(robot, robot).read().position_m, PLACE, atol=1e-6)
-    # Places and orientations of the links' own frames, in the world's: the base, the hand, both fingers, the grasp target.
+    # Places and orientations of the links' own frames: the base, the hand, both fingers, the grasp target.
     base, hand, left, right, grasp = (
         robot._bullet.getLinkState(robot._robot, link, computeForwardKinematics=True)[4:6] for link in (0, 8, 9, 10, 11)
     )
