@@ -173,7 +173,6 @@ def test_methods_and_tasks_are_listed():
         (["panda-cube", "--method", "lsd"], "panda-cube says its method itself"),
         (["panda-cube", "--primitives", "panda-cube"], "--primitives is for learning a task"),
         (["wall", "--primitives", "nothing@latest"], "nothing"),
-        (["wall", "--registry", "http://127.0.0.1:9"], "127.0.0.1:9"),
         (["wall", "--from", "panda-cube@champion"], "--from is for self-play and distillation"),
         (["--method", "lsd", "--from", "panda-cube@champion"], "--from is for self-play; skill discovery begins anew"),
         (["wall", "--method", "lsd"], "needs skills"),
@@ -192,4 +191,11 @@ def test_methods_and_tasks_are_listed():
 )
 def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, arguments, words):
     assert_refused(tandem("train", *arguments), words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_service_that_does_not_answer_is_no_mistake_of_what_was_typed(tmp_path):
+    assert_refused(
+        tandem("train", "wall", "--registry", "http://127.0.0.1:9"), "cannot reach http://127.0.0.1:9", code=1
+    )
     assert list(tmp_path.iterdir()) == []
