@@ -28,6 +28,7 @@ from benchmarks.run_files import CELL_SIZE_M, COUNTERS, FORMAT_VERSION, RANDOM, 
 from service.actors.coverage import NUM_SKILLS, RandomPolicy, skill_paths, skill_trajectories, visited_share
 from service.actors.evaluation import DeterministicPolicy, IdlePolicy, evaluate
 from service.base.errors import TandemError
+from service.base.tensors import split_parts
 from service.base.types import StateArray
 from service.config import Config
 from service.config.skills import SkillDiscoveryConfig
@@ -39,7 +40,7 @@ from service.media.figures import read_records
 from service.policies.frozen_skills import FrozenSkills
 from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
 from service.policies.parameters import Parameters
-from service.registry.loading import read_stages
+from service.store.checkpoints import CheckpointStore, read_checkpoint
 from service.store.run_directory import RunDirectory
 
 GOAL_RECORDS, GOALS_EACH = 60, 10
@@ -94,6 +95,20 @@ def record_run(directory: RunDirectory, name: str) -> Run:
         "curriculum": count_goals(goals, config.world.rest_height_m),
         "goals": sample_goals(goals),
     }
+
+
+def read_stages(directory: RunDirectory) -> dict[int, Parameters]:
+    """Parameters of Bob, or of skills, in a run's snapshots and its newest checkpoint, by env steps, in their order.
+
+    Raises:
+        TandemError: a snapshot is damaged, or there is no usable checkpoint.
+    """
+    part = directory.read_config().part
+    store = CheckpointStore(directory.snapshots, keep=1)
+    saved = [read_checkpoint(store.path(step)) for step in store.steps()]
+    saved.append(CheckpointStore(directory.checkpoints, keep=1).load_latest())
+    stages = {int(each.meta["env_steps"]): split_parts(each.arrays)[part] for each in saved}
+    return dict(sorted(stages.items()))  # a killed run may have a snapshot that is newer than its checkpoint
 
 
 def measure_run(directory: RunDirectory) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from service.envs.gym.registration import TABLETOP_ID
 from service.learner.learner import Learner
 from service.policies.numpy_policy import numpy_bob
 from service.registry.bundled import BUNDLED
-from service.registry.loading import load, read_stages
+from service.registry.loading import load
 from service.registry.registry import Registry
 from service.runs.train import open_run
 from service.store.run_directory import RunDirectory
@@ -352,7 +352,7 @@ def test_a_run_is_measured_from_its_snapshots_and_its_checkpoint(tmp_path, monke
     first = acts(numpy_bob(Learner(config).weights().bob))
     assert measured["evaluations"] == [newest]
     assert (measured["coverage"][0], measured["coverage"][run.num_env_steps]) == (first, newest)
-    assert set(measured["coverage"]) == set(read_stages(RunDirectory(tmp_path)))
+    assert set(measured["coverage"]) == set(record_run.read_stages(RunDirectory(tmp_path)))
     assert newest != first
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from typer.testing import CliRunner
 
 import tandem_skills
 from service.base.errors import TandemError
 from service.cli.main import app
+from tests.cli.typed import tandem
 from tests.methods.trials import SETS
 from tools import docs_reference
 from tools.docs_site import build
@@ -159,7 +159,7 @@ def test_start_heres_task_is_learned_measured_and_loaded(tmp_path, monkeypatch):
     typed = [words for words in commands(START) if "wall" in words[1:2] or "runs/wall-ours-her-0" in words][:2]
     assert [words[0] for words in typed] == ["train", "evaluate"]
     for words in typed:
-        result = CliRunner().invoke(app, [*words, *small[words[0]]])
+        result = tandem(*words, *small[words[0]])
         assert result.exit_code == 0, result.output
     *_, load = blocks((ROOT / "docs" / "downstream.md").read_text(), "python")
     assert '"wall-orchestrator@best"' in load

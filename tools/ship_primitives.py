@@ -50,7 +50,7 @@ def ship(reference: str, source: Registry, target: Path) -> Version:
     shipped = manifest.model_copy(update={"version": number, "parent": None})
     model = target / "models" / name
     with os_errors("write", target):
-        digest = Registry(target).blobs.put(tensors.encode(parameters))
+        digest = Registry(target).put_blob(tensors.encode(parameters))
         assert digest == manifest.blob_sha256
         shutil.rmtree(model, ignore_errors=True)
         write_atomic(model / "versions" / str(number), shipped.to_bytes())

@@ -25,6 +25,12 @@ def listen(host: str, port: int) -> socket.socket:
         raise OSError(errno.EINVAL, f"{host!r} is no name of a host") from error
 
 
+def url_of(host: str, port: int) -> str:
+    """URL for programs on this machine of what listens at a port of a host, which may stand for all addresses."""
+    host = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
+
+
 def free_port(host: str, first: int = 0) -> int:
     """The first free port from ``first`` on, or ``first`` where none of ``MAX_TRIED`` is; 0: any that is free.
 

@@ -32,6 +32,7 @@ from service.base.errors import (
 )
 from service.base.progress import Display, Task, display, doing
 from service.base.version import __version__
+from service.envs.tasks import TASKS
 from service.runs.signals import InterruptError
 
 UsageError: type[Exception] = typer.BadParameter.__bases__[0]
@@ -84,7 +85,7 @@ ActsWithOption = Annotated[
 ]
 TaskOption = Annotated[
     str | None,
-    typer.Option(autocompletion=lambda: task_names(), help="On a task of tandem tasks, such as wall, or of FILE.py."),
+    typer.Option(autocompletion=lambda: [*TASKS], help="On a task of tandem tasks, such as wall, or of FILE.py."),
 ]
 
 
@@ -137,13 +138,6 @@ def choose(option: str, name: str, known: Iterable[str]) -> str:
 RunCodeOption = Annotated[
     bool, typer.Option("--run-task-code", help="Run the code that a published policy's own task brings.")
 ]
-
-
-def task_names() -> list[str]:
-    """What the shell completes."""
-    from service.envs.tasks import TASKS
-
-    return list(TASKS)
 
 
 def what_is_meant(reference: str | None, primitives: str | None) -> tuple[str, str | None]:

@@ -9,20 +9,22 @@ import typer
 
 from service.base.errors import TandemError, did_you_mean
 from service.base.user_code import parse_reference
-from service.cli.common import CommandGroup, JsonOption, print_json, print_table, task_names
+from service.cli.common import CommandGroup, JsonOption, print_json, print_table
+from service.config.find import METHODS, find_class
 from service.config.recipes import DEFAULT_RECIPE, first_comment, recipes, robots
+from service.envs.tasks import TASKS, find_task
 
 configs_app = typer.Typer(name="configs", help="Recipes and robots that come with tandem.", cls=CommandGroup)
 
 
 def targets() -> list[str]:
     """Names for ``tandem train NAME``; the shell completes them."""
-    return [*recipes(), *task_names()]
+    return [*recipes(), *TASKS]
 
 
 def is_task(what: str) -> bool:
     """Whether it names a task, of ours or in a file of a user's."""
-    return what in task_names() or parse_reference(what) is not None
+    return what in TASKS or parse_reference(what) is not None
 
 
 def named(what: str | None, method: str | None, primitives: str | None) -> tuple[Path | None, list[str]]:
@@ -31,7 +33,6 @@ def named(what: str | None, method: str | None, primitives: str | None) -> tuple
     Raises:
         TandemError: no such recipe, task or file; or options that mean nothing there.
     """
-    from service.config.find import METHODS
     from service.methods.task_methods import METHODS as OF_TASKS
 
     known = targets()
@@ -71,7 +72,6 @@ def list_configs(context: typer.Context, as_json: JsonOption = False) -> None:
 
 def methods(as_json: JsonOption = False) -> None:
     """List the methods by which a run learns, and those of tandem evaluate, which learn nothing."""
-    from service.config.find import METHODS, find_class
     from service.methods.task_methods import METHODS as OF_TASKS
 
     rows = []
@@ -87,8 +87,6 @@ def methods(as_json: JsonOption = False) -> None:
 
 def tasks(as_json: JsonOption = False) -> None:
     """List the tasks, for tandem train TASK, and for --task of the commands that know tasks."""
-    from service.envs.tasks import TASKS, find_task
-
     known = map(find_task, TASKS)
     _show([{"name": task.name, "title": task.title, "about": task.description} for task in known], as_json)
 

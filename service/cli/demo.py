@@ -23,8 +23,10 @@ from service.base.ports import free_port
 from service.base.progress import answer
 from service.cli.common import CHAMPION, QuietOption, how_to_go_on
 from service.cli.train import train_and_tell
+from service.config import load_config
 from service.config.recipes import DEFAULT_RECIPE, recipes
 from service.runs.signals import PARENT
+from service.store.run_directory import RunDirectory
 
 if TYPE_CHECKING:
     from service.runs.run import Ending
@@ -65,9 +67,6 @@ def demo(
     quiet: QuietOption = False,
 ) -> None:
     """Watch a robot arm teach itself: a small pre-training from scratch, live in the browser."""
-    from service.config import load_config
-    from service.store.run_directory import RunDirectory
-
     paths = (Path("runs") / f"demo-{number}" for number in count(1))
     path = run_dir or next(path for path in paths if not path.exists())
     if RunDirectory(path).exists:

@@ -7,9 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
+import numpy as np
 import typer
 
 from service.base.errors import TandemError, in_metres, one_line
+from service.base.files import write_atomic
 from service.cli.common import (
     SOURCE,
     ActsWithOption,
@@ -24,13 +26,16 @@ from service.cli.common import (
     print_json,
     what_is_meant,
 )
+from service.config import WorldConfig, changed_config
+from service.config.find import METHODS
+from service.envs.observations import each_object, layouts
+from service.store.run_directory import encode_result
 
 if TYPE_CHECKING:
     from pydantic import JsonValue
 
     from service.actors.evaluation import DeterministicPolicy
     from service.base.types import Metrics, StateArray
-    from service.config import WorldConfig
     from service.envs.sampling import GoalKind
     from service.media.video import FilmOptions
     from service.registry.loading import Trained
@@ -92,8 +97,6 @@ def evaluate(
     reference, primitives = what_is_meant(reference, primitives)
     with loading():
         from service.actors.evaluation import evaluate as run
-        from service.config import changed_config
-        from service.envs.observations import layouts
         from service.envs.sampling import GOAL_KINDS
         from service.methods.task_evaluation import FINAL_SEED, numbers_of
         from service.registry.loading import load
@@ -150,7 +153,6 @@ def evaluate(
 def _players(trained: Trained, method: str | None) -> dict[str, DeterministicPolicy]:
     """The policies that are measured, by name."""
     from service.actors.evaluation import IdlePolicy
-    from service.config.find import METHODS
     from service.methods.task_methods import find_method
 
     players: dict[str, DeterministicPolicy] = {}
@@ -168,12 +170,10 @@ def _players(trained: Trained, method: str | None) -> dict[str, DeterministicPol
 
 def _write_result(path: Path, trained: Trained, method: str | None, seed: int, numbers: Metrics) -> None:
     """Write a file that says what a run's configuration and result say."""
-    from service.base.files import write_atomic
-    from service.methods.task_methods import METHODS
-    from service.store.run_directory import encode_result
+    from service.methods.task_methods import METHODS as OF_TASKS
 
     method = method or ("asp-only" if trained.kind == "primitives" else f"{trained.skills.method}-zero-shot")
-    takes = method not in METHODS or METHODS[method].takes is not None
+    takes = method not in OF_TASKS or OF_TASKS[method].takes is not None
     result: dict[str, JsonValue] = {
         "task": None if trained.task is None else trained.task.name,
         "method": method,
@@ -284,32 +284,45 @@ def parse_goals(text: str, world: WorldConfig) -> GoalKind | StateArray:
     """A kind of random goals, or (N, 3 K) goals in metres.
 
     Raises:
-        TandemError: neither; or a goal outside of the workspace, or inside a fixture.
+        TandemError: neither; or as for ``parse_points``.
     """
-    import numpy as np
-
-    from service.envs.observations import each_object
-    from service.envs.sampling import GOAL_KINDS, check_goals, inside_fixtures
-    from service.generator.validity import in_workspace
+    from service.envs.sampling import GOAL_KINDS, check_goals
 
     for kind in GOAL_KINDS:
         if text.strip() == kind:
             check_goals(kind, world)
             return kind
+    return parse_points("--goals", text, world, f"one of {', '.join(GOAL_KINDS)}, or points with ; between, each")
+
+
+def parse_points(option: str, text: str, world: WorldConfig, expected: str) -> StateArray:
+    """(N, 3 K) goals in metres.
+
+    Args:
+        option: they were typed for.
+        text: as it was typed.
+        world: that they are in.
+        expected: words for what can be typed, up to its form.
+
+    Raises:
+        TandemError: no points; or one outside of the workspace, or inside a fixture.
+    """
+    from service.envs.sampling import inside_fixtures
+
     try:
         points = np.array([[float(part) for part in point.split(",")] for point in text.strip("; ").split(";")])
     except ValueError:
         points = np.empty(0)
     if points.shape[1:] != (3 * world.num_objects,) or not np.isfinite(points).all():
         each = ",".join(["x,y,z"] * world.num_objects)
+        raise TandemError(f"{option} {text!r}: write {expected} {each} in metres")
+    low, high = np.round((world.workspace.lower_m, world.workspace.upper_m), 6)  # sums, such as 0.12499999999999999
+    for point in points[(each_object(points) != np.clip(each_object(points), low, high)).any(axis=(1, 2))]:
         raise TandemError(
-            f"--goals {text!r}: write one of {', '.join(GOAL_KINDS)}, or points {each} in metres with ; between"
+            f"{option}: {in_metres(point)} is outside of the workspace, ({in_metres(low)}) to ({in_metres(high)}) m"
         )
-    for point in points[~in_workspace(each_object(points), world.workspace).all(axis=1)]:
-        low, high = (in_metres(corner) for corner in (world.workspace.lower_m, world.workspace.upper_m))
-        raise TandemError(f"--goals: {in_metres(point)} is outside of the workspace, ({low}) to ({high}) m")
     for point in points[inside_fixtures(points, world)]:
         raise TandemError(
-            f"--goals: at {in_metres(point)} the object would be inside a fixture, or the upright box around it"
+            f"{option}: at {in_metres(point)} the object would be inside a fixture, or the upright box around it"
         )
     return points

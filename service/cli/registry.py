@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from service.base.errors import StorageError, one_line
+from service.base.errors import RegistryError, StorageError, one_line
+from service.base.files import write_atomic
 from service.cli.common import (
     REGISTRY,
     SOURCE,
@@ -22,11 +23,10 @@ from service.cli.common import (
     print_json,
     print_table,
 )
-
-if TYPE_CHECKING:
-    from service.registry.manifest import Manifest
-    from service.registry.names import Version
-    from service.registry.registry import Registry
+from service.registry.bundled import BUNDLED, ExportedVersion, find_version, is_bundled
+from service.registry.manifest import Manifest
+from service.registry.names import check_alias
+from service.registry.registry import Registry
 
 registry_app = typer.Typer(
     name="registry", help="Frozen primitives: versions, aliases, export.", cls=CommandGroup, no_args_is_help=True
@@ -50,8 +50,6 @@ def publish(
 ) -> None:
     """Measure what a run has learned until now, and publish it: primitives, skills or a policy of a task."""
     with loading():
-        from service.registry.names import check_alias
-        from service.registry.registry import Registry
         from service.runs.train import publish_learned
 
     if alias is not None:
@@ -65,9 +63,6 @@ def publish(
 @registry_app.command("list")
 def list_versions(directory: RegistryOption = REGISTRY, as_json: JsonOption = False) -> None:
     """List every version: yours, and those that come with tandem (bundled)."""
-    from service.registry.bundled import BUNDLED, is_bundled
-    from service.registry.registry import Registry
-
     own, bundled = Registry(directory), Registry(BUNDLED)
     if not own.names():
         typer.echo(f"nothing published in {directory} yet", err=True)
@@ -87,7 +82,7 @@ def list_versions(directory: RegistryOption = REGISTRY, as_json: JsonOption = Fa
 @registry_app.command()
 def show(reference: _Reference, directory: RegistryOption = REGISTRY, as_json: JsonOption = False) -> None:
     """Show what a version says about itself."""
-    registry, version = _found(reference, directory)
+    registry, version = find_version(reference, directory)
     manifest = registry.manifest(str(version))
     summary = _summary(registry, manifest)
     tree = manifest.model_dump(mode="json")
@@ -110,12 +105,10 @@ def verify(
     directory: RegistryOption = REGISTRY,
 ) -> None:
     """Check every byte against its digest, and every parameter; exit code 1 when something is damaged."""
-    from service.base.errors import RegistryError
     from service.registry.loading import network_problems
-    from service.registry.registry import Registry
 
     if reference is not None:
-        registry, version = _found(reference, directory)
+        registry, version = find_version(reference, directory)
         problems = registry.verify(str(version), network_problems)
     elif directory.is_dir():
         problems = Registry(directory).verify(check=network_problems)
@@ -135,7 +128,7 @@ def alias(
     directory: RegistryOption = REGISTRY,
 ) -> None:
     """Make or move an alias to a version."""
-    registry, version = _found(reference, directory)
+    registry, version = find_version(reference, directory)
     registry.set_alias(version.name, alias, version.number)
     typer.echo(f"{version.name}@{alias} is now {version}")
 
@@ -147,7 +140,7 @@ def export(
     directory: RegistryOption = REGISTRY,
 ) -> None:
     """Write a version as two files that need no registry; every command takes their directory as a version."""
-    registry, version = _found(reference, directory)
+    registry, version = find_version(reference, directory)
     manifest = registry.export(str(version), target)
     typer.echo(f"{manifest.reference} is in {target}")
 
@@ -162,10 +155,9 @@ def card(
     directory: RegistryOption = REGISTRY,
 ) -> None:
     """Write a model card for a hub: what a version is, how it was trained, how good it is, how to load it."""
-    from service.base.files import write_atomic
     from service.registry.card import model_card
 
-    registry, version = _found(reference, directory)
+    registry, version = find_version(reference, directory)
     text = model_card(registry.manifest(str(version)), licence=licence)
     if out is None:
         typer.echo(text, nl=False)
@@ -174,17 +166,8 @@ def card(
     typer.echo(f"the card of {version} is in {out}")
 
 
-def _found(reference: str, directory: Path) -> tuple[Registry, Version]:
-    """A version, and the registry that holds it."""
-    from service.registry.bundled import find_version
-
-    return find_version(reference, directory)
-
-
 def _summary(registry: Registry, manifest: Manifest) -> dict[str, Any]:
     """A version's row in the list; two registries may both have a version 1, so it says where this one is."""
-    from service.registry.bundled import ExportedVersion, is_bundled
-
     exported = isinstance(registry, ExportedVersion)
     return {
         "name": manifest.name,

@@ -9,12 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from pydantic import ValidationError
 
 from service.base.errors import TandemError, in_metres
+from service.base.types import StateArray
 from service.cli.common import CHAMPION, REFERENCE, SOURCE, CommandGroup, SourceOption, print_json
+from service.cli.evaluate import parse_points
+from service.config.frozen import first_error
+from service.config.tree import apply_override
+from service.config.world import WorldConfig
+from service.runs.signals import StopSignals
 
 if TYPE_CHECKING:
-    from service.base.types import StateArray
     from service.registry.loading import Trained
     from service.robot.backends import Backend, BackendConfig
     from service.robot.limits import Box
@@ -58,7 +64,7 @@ def run(
     from service.robot.backends import read_backend
     from service.robot.calibrate import read_calibration
     from service.robot.loop import Bridge
-    from service.robot.running import RobotLog, parse_goal, play
+    from service.robot.running import open_log, play
 
     config, described, player = _bridge_config(overrides), read_backend(robot), _load(policy, registry)
     goal_m = None if goal is None else parse_goal(goal, player.world)
@@ -71,13 +77,11 @@ def run(
 
         def record(row: dict[str, Any]) -> None:
             if written is not None:
-                written.record(row)
+                written.append({"episode": len(outcomes), **row})
             if dry_run:
                 _print_step(row, bridge.safe.limiter.box, to_stderr=as_json)
 
         def ready(episode: int, goal_m: StateArray) -> None:
-            if written is not None:
-                written.episode = episode
             wait(f"goal {episode + 1} of {episodes}, {in_metres(goal_m)}: put arm and object to their start")
 
         bridge = Bridge(
@@ -91,7 +95,7 @@ def run(
             "bridge": config.model_dump(mode="json"),
             "calibration": None if calibration is None else str(calibration),
         }
-        written = None if log is None else RobotLog(log, header, player.world)
+        written = None if log is None else open_log(log, header, player.world)
         outcomes = []
         for outcome in play(
             bridge, backend, player, goal_m=goal_m, num_episodes=episodes, num_steps=steps, seed=seed, ready=ready
@@ -146,11 +150,20 @@ def replay(
     typer.echo(f"video: {out}")
 
 
-def _bridge_config(overrides: list[str] | None) -> BridgeConfig:
-    from pydantic import ValidationError
+def parse_goal(text: str, world: WorldConfig) -> StateArray:
+    """(3,) a goal of a robot in metres, no lower than where the object lies on the table.
 
-    from service.config.frozen import first_error
-    from service.config.tree import apply_override
+    Raises:
+        TandemError: another goal, or several; or as for ``parse_points``.
+    """
+    goals = parse_points("--goal", text, world, "a point")
+    if len(goals) > 1 or goals[0, 2] < round(world.rest_height_m, 6):
+        raise TandemError(f"--goal {text}: write one point, no lower than the object lies, {world.rest_height_m:.3f} m")
+    goal: StateArray = goals[0]
+    return goal
+
+
+def _bridge_config(overrides: list[str] | None) -> BridgeConfig:
     from service.robot.loop import BridgeConfig
 
     tree: dict[str, Any] = {}
@@ -180,7 +193,6 @@ def _connected(
     from service.robot.backends import connect
     from service.robot.safety import always_held
     from service.robot.watchdogs import HeldKey
-    from service.runs.signals import StopSignals
 
     if dead_man not in (None, "key", "none"):
         raise TandemError(f"--dead-man {dead_man!r}: choose key or none")

@@ -23,6 +23,9 @@ from service.cli.common import (
     loading,
     what_is_meant,
 )
+from service.registry.registry import Registry
+from service.registry.token import VARIABLE, read_token
+from service.runs.signals import StopSignals
 
 
 def serve(
@@ -40,8 +43,6 @@ def serve(
 ) -> None:
     """Show finished and running runs and the registry over REST, to Prometheus, and to a browser."""
     from service.base.ports import choose_port
-    from service.registry.registry import Registry
-    from service.registry.token import VARIABLE, read_token
     from service.status.run_reader import open_reader
 
     with needs_extra("serve", "tandem serve"):
@@ -79,7 +80,6 @@ def play(
         from service.registry.loading import load
         from service.robot.play.following import Following, is_running
         from service.robot.play.server import LiveWorld
-        from service.runs.signals import StopSignals
 
         players = (
             load(reference, registry, primitives, run_task_code=run_task_code).expect_goals("tandem play").on(task)

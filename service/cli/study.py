@@ -12,14 +12,21 @@ import typer
 from service.base.errors import ConfigError, TandemError, one_line
 from service.cli.common import REGISTRY, how_to_go_on, loading, print_table, shown, stopped, traceback_in
 from service.cli.configs import is_task, named
+from service.config import Config, load_config
+from service.config.find import METHODS
 from service.config.recipes import DEFAULT_RECIPE, recipes
+from service.envs.tasks import PAPERS
+from service.registry.names import is_service
 from service.runs.grid import SEED, Settings, check_once, name_runs, parse_grid
+from service.runs.progress import Progress
+from service.runs.resuming import resumed_config
+from service.runs.signals import InterruptError, StopSignals
+from service.runs.study_run import Place
+from service.store.address import address_from_environment
 
 if TYPE_CHECKING:
     from service.cluster.ray_connection import ClusterOptions
-    from service.config import Config
     from service.runs.study import Study, StudyFile
-    from service.runs.study_run import Place
 
 Planned = dict[str, tuple[Settings, Path | None, list[str]]]
 """By the name of a run its settings, the file of its configuration, and what is changed in that."""
@@ -73,13 +80,8 @@ def train_study(
         trackers: of every run; see ``service.runs.trackers``.
         start_from: as typed; what the runs of a new study begin from.
     """
-    from service.config import load_config
     from service.registry.loading import load
-    from service.registry.names import is_service
-    from service.runs.progress import Progress
-    from service.runs.signals import InterruptError, StopSignals
     from service.runs.study import Study
-    from service.runs.study_run import Place
 
     for override in overrides:
         if (key := override.partition("=")[0].strip()) in {SEED, *parse_grid(grid)}:
@@ -154,15 +156,13 @@ def _plan(
 
     ``default`` is the file of runs for which none is named.
     """
-    from service.config.find import METHODS as KNOWN
-    from service.envs.tasks import PAPERS
-    from service.methods.task_methods import METHODS
+    from service.methods.task_methods import METHODS as OF_TASKS
 
     given = parse_grid(grid, seeds)
     whats, methods = _words(what), _words(method)
     whats = list(PAPERS) if whats == ["all"] else whats
     if methods == ["all"]:  # skills are other commands, each with its own --primitives
-        methods = [name for name, how in METHODS.items() if name in KNOWN and how.takes != "skills"]
+        methods = [name for name, how in OF_TASKS.items() if name in METHODS and how.takes != "skills"]
     kind = "task" if all(map(is_task, whats)) else "recipe"
     several = {key: words for key, words in ((kind, whats), ("method", methods)) if len(words) > 1}
     for key, word, words in ((kind, what, whats), ("method", method, methods)):
@@ -187,8 +187,6 @@ def _resumed(
     Raises:
         ConfigError: the study has other runs, or keeps what is to change.
     """
-    from service.runs.resuming import resumed_config
-
     saved = study.read().runs
     if planned and {name: each for name, (each, _, _) in planned.items()} != {
         name: run.settings for name, run in saved.items()
@@ -233,8 +231,6 @@ def _registry(source: str, configs: Iterable[Config], publish: bool | None) -> P
 
 def _on_ray(stack: ExitStack, options: ClusterOptions, address: str | None, path: Path, source: str) -> Place:
     from service.cluster.ray_connection import connected
-    from service.registry.names import is_service
-    from service.store.address import address_from_environment
 
     stack.enter_context(connected(address))
     from service.cluster.ray_task import cluster_place

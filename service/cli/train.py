@@ -28,16 +28,21 @@ from service.cli.common import (
 )
 from service.cli.configs import named, targets
 from service.cli.study import is_study, train_study
+from service.config import Config, load_config
 from service.config.recipes import DEFAULT_RECIPE, recipes
+from service.registry.token import read_token
+from service.runs.progress import Progress
+from service.runs.resuming import resumed_config
+from service.runs.signals import InterruptError
 from service.runs.trackers import Trackers, find_factory
+from service.store.models import RUN_ID
+from service.store.run_directory import RunDirectory
 
 if TYPE_CHECKING:
     from service.cluster.ray_connection import ClusterOptions
-    from service.config import Config
     from service.registry.loading import Trained
     from service.runs.run import Ending, OnIteration
     from service.runs.train import Finished
-    from service.store.run_directory import RunDirectory
 
 AUTO, EXACTLY = "auto", "exactly"
 """Values of ``--resume``; the second where it is typed alone."""
@@ -146,15 +151,9 @@ def train(
     quiet: QuietOption = False,
 ) -> None:
     """Train what a recipe, a task or a file says, in this process or on a Ray cluster, and publish it."""
-    from service.config import load_config
-    from service.registry.loading import load
-    from service.runs.resuming import resumed_config
-    from service.store.models import RUN_ID
-    from service.store.run_directory import RunDirectory
 
     def cluster_options() -> ClusterOptions:
         from service.cluster.ray_connection import ClusterOptions, parse_status
-        from service.registry.token import read_token
 
         where = parse_status(status, read_token(token_file))
         return ClusterOptions(num_actors, actor_threads, learner_cpus, where)
@@ -209,6 +208,8 @@ def train(
         resolved = resumed_config(directory, overrides, file)
     else:
         with loading():
+            from service.registry.loading import load
+
             start = load(start_from, source).expect("primitives", by="--from") if start_from is not None else None
             resolved = load_config(begun, overrides).begin(source, start)
     if publish is None:
@@ -235,9 +236,7 @@ def train_and_tell(
     """Train, show how far that is, and say what came out, or how to go on."""
     with loading():
         from service.runs import train as training
-    from service.runs.progress import Progress
-    from service.runs.signals import InterruptError
-    from service.store.disk_reader import run_id_of
+        from service.store.disk_reader import run_id_of
 
     runtime = training.Runtime()
     where = "local" if cluster is None else "ray"

@@ -20,13 +20,11 @@ from service.base.version import __version__
 from service.config import Config
 from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
-from service.envs.gym.tabletop import action_space, goal_space
+from service.envs.gym.tabletop import FURTHEST_M, action_space, goal_space
 from service.envs.observations import distances
 from service.media.recording import RecordedEpisodes, RecordedRound
 
 _NAME = re.compile(r"(?![\w-]/[\w-]+$)(?:[\w-]+/)*[\w-]+-v[0-9]+")  # what Minari takes
-_FURTHEST_M = 10.0
-"""Bound of every position, as in the environments."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,11 +138,11 @@ def _arrays(played: Played, worlds: WorldBatch, success_distance_m: float) -> di
     """An episode as ``EpisodeBuffer`` has it; what was seen follows from the states."""
     num_steps, num = len(played.actions), len(played.states)
     worlds.restore(played.states, np.arange(worlds.num_worlds) < num)
-    achieved = np.clip(worlds.object_position[:num], -_FURTHEST_M, _FURTHEST_M)
+    achieved = np.clip(worlds.object_position[:num], -FURTHEST_M, FURTHEST_M)
     success = np.all(distances(achieved, played.goal) <= success_distance_m, axis=1)
     return {
         "observations": {
-            "observation": np.clip(worlds.positions()[:num], -_FURTHEST_M, _FURTHEST_M),
+            "observation": np.clip(worlds.positions()[:num], -FURTHEST_M, FURTHEST_M),
             "achieved_goal": achieved.astype(np.float32),
             "desired_goal": np.tile(played.goal.astype(np.float32), (num_steps + 1, 1)),
         },

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from itertools import combinations, cycle, product
+from itertools import accumulate, combinations, cycle, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -241,12 +241,8 @@ def _progress(records: Sequence[dict[str, Any]]) -> str:
 def _smooth(values: StateArray, span: float) -> StateArray:
     """The exponential moving average with Adam's correction for its start, so the first value is not favoured."""
     decay = 1.0 - 2.0 / (span + 1.0)
-    average = weight = 0.0
-    smoothed = np.empty_like(values)
-    for index, value in enumerate(values):
-        average = decay * average + (1.0 - decay) * value
-        weight = decay * weight + (1.0 - decay)
-        smoothed[index] = average / weight
+    averages = accumulate((1.0 - decay) * values, lambda average, value: decay * average + value)
+    smoothed: StateArray = np.array(list(averages)) / (1.0 - decay ** np.arange(1, len(values) + 1))
     return smoothed
 
 

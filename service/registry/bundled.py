@@ -8,7 +8,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from service.base.errors import UnknownVersionError, did_you_mean
-from service.registry.blobs import BlobStore
 from service.registry.manifest import read_manifest
 from service.registry.names import Version, is_service, split_reference
 from service.registry.registry import EXPORTED_MANIFEST, EXPORTED_PARAMETERS, Registry
@@ -85,14 +84,10 @@ class ExportedVersion(Registry):
         self._file = root / EXPORTED_MANIFEST
         manifest = read_manifest(self._file)
         self.version = Version(manifest.name, manifest.version)
-        self.blobs = _OneBlob(root)
 
     def _manifest_path(self, version: Version) -> Path:
         return self._file if version == self.version else super()._manifest_path(version)
 
-
-class _OneBlob(BlobStore):
-    """Parameters in a file with a name of its own; what reads them checks their digest all the same."""
-
-    def path(self, digest: str) -> Path:
-        return self._directory / EXPORTED_PARAMETERS
+    def blob_path(self, digest: str) -> Path:
+        """Its one file of parameters; what reads them checks their digest all the same."""
+        return self.root / EXPORTED_PARAMETERS

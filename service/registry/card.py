@@ -10,7 +10,6 @@ from typing import Any
 import yaml
 
 from service.config.skills import SKILLS_OF
-from service.registry.loading import ORCHESTRATOR, SKILLS
 from service.registry.manifest import Manifest
 
 LICENCE = "apache-2.0"
@@ -135,10 +134,10 @@ def _kind(manifest: Manifest) -> tuple[str, str, str, list[str]]:
     """What differs by kind: what it is, code that loads it, words about that, and keys of the papers it rests on."""
     spaces, config, name = manifest.spaces, manifest.config, manifest.reference
     after = "In place of the name, the folder that `tandem registry export` has written will do."
-    if spaces.get("kind") == ORCHESTRATOR:
+    if spaces.get("kind") == "orchestrator":
         method, frozen = str(spaces.get("method", "")), spaces.get("primitives", "?")
         skilled = method in (*SKILLS_OF, "any-skills")
-        takes, how = (SKILLS, [method] * (method in PAPERS)) if skilled else ("primitives", ["self-play", "mcp"])
+        takes, how = ("skills", [method] * (method in PAPERS)) if skilled else ("primitives", ["self-play", "mcp"])
         return (
             f"An orchestrator of Tandem: a policy for the task *{spaces.get('task', '?')}* that acts with the frozen "
             f"{takes} `{frozen}` (digest `{str(spaces.get('primitives_digest', '?'))[:12]}`), and with no others.",
@@ -148,7 +147,7 @@ def _kind(manifest: Manifest) -> tuple[str, str, str, list[str]]:
             f"The registry, or the one that comes with the package, has to have `{frozen}`, too.",
             ["tandem", *how, "sac", *["her"] * method.endswith("-her")],
         )
-    if spaces.get("kind") == SKILLS:
+    if spaces.get("kind") == "skills":
         method = str(_at(config, "skills", "method") or "?")
         found_by = method.upper() if method in SKILLS_OF else method
         return (

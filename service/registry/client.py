@@ -19,10 +19,9 @@ from service.base.errors import (
 )
 from service.base.files import write_atomic
 from service.base.parsing import ParseError, parse_json
-from service.registry.blobs import check_digest
 from service.registry.manifest import parse_manifest
 from service.registry.names import Version, split_reference
-from service.registry.registry import Registry
+from service.registry.registry import Registry, check_digest
 from service.registry.token import VARIABLE, read_token
 
 with needs_extra("serve", "fetching primitives"):
@@ -71,11 +70,11 @@ def fetch_primitives(url: str, reference: str, *, cache_dir: Path | None = None)
             )
         digest = manifest.blob_sha256
         try:
-            registry.blobs.get(digest)
+            registry.get_blob(digest)
         except DamagedBlobError:  # or not there yet
             data = _get(service, f"/v1/blobs/sha256/{digest}")
             check_digest(f"{manifest.reference} from {base}", data, digest)
-            registry.blobs.put(data)
+            registry.put_blob(data)
     path = registry.root / "models" / name / "versions" / str(manifest.version)
     write_atomic(path, manifest.to_bytes())  # after its parameters: a version that is listed can be loaded
     return registry, Version(name, manifest.version)

@@ -43,13 +43,10 @@ if TYPE_CHECKING:
     from service.envs.sampling import GoalKind
 
 Kind = Literal["primitives", "skills", "orchestrator"]
-"""Bob, who has primitives unless he is monolithic; skills of a baseline; or a policy of a downstream task."""
-PRIMITIVES: Kind = "primitives"
-SKILLS: Kind = "skills"
-"""Part of a run's checkpoint that holds frozen skills, and kind in the spaces of their manifest."""
-ORCHESTRATOR: Kind = "orchestrator"
-_DESCRIPTION = "policy.json"
-"""Is in the folders that ``tandem export`` writes."""
+"""Bob, who has primitives unless he is monolithic; skills of a baseline; or a policy of a downstream task.
+
+Spaces in a manifest have it as ``kind``; without it they are of primitives.
+"""
 _SHOWN = 12
 """Characters of a digest in messages."""
 
@@ -91,7 +88,7 @@ class Trained:
         """What it is called elsewhere, where paths of this machine mean nothing."""
         if self.manifest is not None:
             return self.manifest.reference
-        if self.kind == ORCHESTRATOR or self.path is None:
+        if self.kind == "orchestrator" or self.path is None:
             return self.config.directory_name
         return f"{self.config.name} of the run {self.path.resolve().name}"
 
@@ -165,7 +162,7 @@ class Trained:
         if self.trained is not None:
             return self.trained.primitives
         if not isinstance(self.policy, NumpyMCPPolicy):
-            why = "trained with policy.monolithic_bob" if self.kind == PRIMITIVES else self._what
+            why = "trained with policy.monolithic_bob" if self.kind == "primitives" else self._what
             raise TandemError(f"{self.label} has no primitives: it is {why}")
         return self.policy
 
@@ -185,7 +182,7 @@ class Trained:
     @property
     def digest(self) -> str:
         """SHA-256 of the parameters; of primitives and skills as ``parameters_digest`` has it."""
-        policy = self.skills if self.kind == SKILLS else self.policy
+        policy = self.skills if self.kind == "skills" else self.policy
         if isinstance(policy, NumpyPolicy | FrozenSkills):
             return parameters_digest(policy)
         return digest_of(self.trained.digest if self.trained is not None else "", self.parameters)
@@ -256,8 +253,7 @@ class Trained:
         """
         if self.kind in kinds:
             return self
-        words = {PRIMITIVES: "primitives", SKILLS: "skills", ORCHESTRATOR: "a policy of a task"}
-        wanted = " or ".join(words[kind] for kind in kinds)
+        wanted = " or ".join("a policy of a task" if kind == "orchestrator" else kind for kind in kinds)
         hint = f": name {self.trained.name}, which it acts with" if self.trained and self.trained.kind in kinds else ""
         raise TandemError(f"{self.label} is {self._what}; {by} needs {wanted}{hint}")
 
@@ -267,15 +263,15 @@ class Trained:
         Raises:
             TandemError: it cannot; see ``expect``.
         """
-        if self.kind == SKILLS and self.skills.zero_shot == "none":
+        if self.kind == "skills" and self.skills.zero_shot == "none":
             raise TandemError(f"{self.label} is {self._what}, which no goal leads; {by} needs a policy with goals")
         return self
 
     @property
     def _what(self) -> str:
-        if self.kind == SKILLS:
+        if self.kind == "skills":
             return f"a set of skills of {self.skills.method}"
-        if self.kind == PRIMITIVES or self.task is None:
+        if self.kind == "primitives" or self.task is None:
             return "a set of primitives"
         return f"a policy of the task {self.task.name}"
 
@@ -292,7 +288,7 @@ def load(
     is_place = path.is_dir() or "/" in reference or (path.suffix == ".safetensors" and path.is_file())
     if is_exported(path) or not is_place:
         found = _load_version(reference, registry, primitives, run_task_code=run_task_code)
-    elif (path / _DESCRIPTION).exists():
+    elif (path / "policy.json").exists():
         raise TandemError(
             f"{reference} is a folder of tandem export, made for use without tandem: name what it was made of, as its "
             "README.md says"
@@ -309,20 +305,6 @@ def load(
     if primitives is not None and found.trained is None:
         raise TandemError(f"{found.label} acts with no others: leave out primitives {primitives}")
     return found
-
-
-def read_stages(directory: RunDirectory) -> dict[int, Parameters]:
-    """Parameters of Bob, or of skills, in a run's snapshots and its newest checkpoint, by env steps, in their order.
-
-    Raises:
-        TandemError: a snapshot is damaged, or there is no usable checkpoint.
-    """
-    part = directory.read_config().part
-    store = CheckpointStore(directory.snapshots, keep=1)
-    saved = [read_checkpoint(store.path(step)) for step in store.steps()]
-    saved.append(CheckpointStore(directory.checkpoints, keep=1).load_latest())
-    stages = {int(each.meta["env_steps"]): split_parts(each.arrays)[part] for each in saved}
-    return dict(sorted(stages.items()))  # a killed run may have a snapshot that is newer than its checkpoint
 
 
 def _task_of(spaces: Mapping[str, Any], manifest: Manifest, label: str, *, run_code: bool) -> Task:
@@ -355,8 +337,8 @@ def _load_version(reference: str, registry: Path | str, primitives: str | None, 
     # two registries may both have a version 1: which one was meant must be seen
     label = f"{version} (bundled)" if is_bundled(place) else str(version)
     path = Path(reference) if is_exported(Path(reference)) else None
-    kind = manifest.spaces.get("kind", PRIMITIVES)
-    if kind == ORCHESTRATOR:
+    kind = manifest.spaces.get("kind", "primitives")
+    if kind == "orchestrator":
         spaces: dict[str, Any] = dict(manifest.spaces)
         try:
             name, digest, hold_steps = spaces["primitives"], spaces["primitives_digest"], spaces["hold_steps"]
@@ -371,15 +353,15 @@ def _load_version(reference: str, registry: Path | str, primitives: str | None, 
         trained = _find_frozen(label, name, digest, (registry, primitives))
         policy = learned_policy(parameters, trained, trained.config, hold_steps)
         return Trained(
-            label, ORCHESTRATOR, trained.config, policy, parameters, manifest, path, trained=trained, **about
+            label, "orchestrator", trained.config, policy, parameters, manifest, path, trained=trained, **about
         )
     config = acting_config(manifest.config, where=f"the manifest of {reference}")
     try:
         if isinstance(config, SkillDiscoveryConfig):
-            return Trained(label, SKILLS, config, _skills(config, parameters), parameters, manifest, path)
-        if kind == PRIMITIVES:
+            return Trained(label, "skills", config, _skills(config, parameters), parameters, manifest, path)
+        if kind == "primitives":
             bob, networks = NumpyMCPPolicy(parameters), {"bob/policy": parameters}
-            return Trained(label, PRIMITIVES, config, bob, parameters, manifest, path, networks)
+            return Trained(label, "primitives", config, bob, parameters, manifest, path, networks)
     except PolicyError as error:
         raise TandemError(f"{label} holds no {kind}: {error}") from None
     raise TandemError(f"{label} is of the kind {kind!r}, which this tandem cannot load; load it with a newer one")
@@ -391,7 +373,7 @@ def network_problems(manifest: Manifest, arrays: Parameters) -> list[str]:
     A manifest without networks in its configuration describes none, and nothing is asked of it.
     """
     try:
-        if manifest.spaces.get("kind") == ORCHESTRATOR:
+        if manifest.spaces.get("kind") == "orchestrator":
             numpy_actor(dict(arrays))
         elif manifest.config.keys() & {"policy", "skills"}:
             config = acting_config(manifest.config, where="its configuration")
@@ -421,7 +403,7 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
         raise TandemError(f"{label} is a run of the method {config.method}, which makes nothing that can be loaded")
     parameters = parts[config.part]
     if isinstance(config, SkillDiscoveryConfig):
-        return Trained(label, SKILLS, config, _skills(config, parameters), parameters, path=path)
+        return Trained(label, "skills", config, _skills(config, parameters), parameters, path=path)
     if isinstance(config, TaskConfig):
         trained = None
         if config.primitives_digest is not None:
@@ -429,7 +411,7 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
         policy = learned_policy(parameters, trained, config, config.hold_steps)
         task = find_task(config.task, config.code)
         about: dict[str, Any] = {"task": task, "method": config.method, "trained": trained}
-        return Trained(label, ORCHESTRATOR, config, policy, parameters, path=path, **about)
+        return Trained(label, "orchestrator", config, policy, parameters, path=path, **about)
     networks: dict[str, Parameters] = {"bob/policy": parameters}
     alice = None
     if "learner" in parts and "alice" in parts:
@@ -439,13 +421,13 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
         }
         alice = NumpyGaussianPolicy(parts["alice"])
     return Trained(
-        label, PRIMITIVES, config, numpy_bob(parameters), parameters, path=path, networks=networks, alice=alice
+        label, "primitives", config, numpy_bob(parameters), parameters, path=path, networks=networks, alice=alice
     )
 
 
 def learned_policy(parameters: Parameters, trained: Trained | None, config: Config, hold_steps: int) -> LearnedPolicy:
     """A policy of a task, of its actor's parameters, and of what it acts with, learned in the world of ``config``."""
-    frozen = None if trained is None else trained.skills if trained.kind == SKILLS else trained.primitives
+    frozen = None if trained is None else trained.skills if trained.kind == "skills" else trained.primitives
     return LearnedPolicy(parameters, frozen, layouts(config.world), hold_steps)
 
 
@@ -461,7 +443,7 @@ def _find_frozen(label: str, name: str, digest: str, place: tuple[Path | str, st
         try:
             is_place = reference == named or "/" in reference
             found = load(reference, root) if is_place else _load_version(reference, root, None, run_task_code=False)
-            trained = found.expect(PRIMITIVES, SKILLS, by=label)
+            trained = found.expect("primitives", "skills", by=label)
         except TandemError as error:
             problems.append(str(error))
             continue

@@ -18,7 +18,7 @@ from service.base.errors import DamagedBlobError, FormatVersionError, RegistryEr
 from service.base.files import os_errors, read_regular
 from service.base.parsing import ParseError, parse_json
 from service.config import Config, parse_config
-from service.config.frozen import FrozenModel
+from service.config.frozen import FrozenModel, first_error
 from service.config.tree import group_of
 
 FORMAT_VERSION = 1
@@ -95,10 +95,8 @@ def make_manifest(fields: Mapping[str, object]) -> Manifest:
         manifest = Manifest.model_validate(fields)
         json.dumps(manifest.model_dump(mode="json"), allow_nan=False)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
         raise RegistryError(
-            f"manifest of {fields.get('name')}: {key} = {first['input']!r}: {first['msg']}; give finite JSON values"
+            f"manifest of {fields.get('name')}: {first_error(error)}; give finite JSON values"
         ) from None
     except ValueError:
         raise RegistryError(
@@ -139,8 +137,7 @@ def parse_manifest(data: bytes, path: Path | str) -> Manifest:
     try:
         return Manifest.model_validate(tree)
     except ValidationError as error:
-        first = error.errors()[0]
-        raise DamagedBlobError(f"manifest {path} is not valid: {first['loc']}: {first['msg']}; {_MEND}") from None
+        raise DamagedBlobError(f"manifest {path} is not valid: {first_error(error)}; {_MEND}") from None
 
 
 def acting_config(tree: dict[str, Any], *, where: str) -> Config:

@@ -19,12 +19,10 @@ from service.envs.tasks import find_task
 from service.policies.frozen_skills import FrozenSkills
 from service.policies.numpy_policy import numpy_bob
 from service.policies.parameters import Parameters
-from service.registry.blobs import sha256_of
 from service.registry.bundled import BUNDLED, find_version
 from service.registry.learned import num_inputs
-from service.registry.loading import ORCHESTRATOR, PRIMITIVES, SKILLS
 from service.registry.names import Version, is_service
-from service.registry.registry import Registry
+from service.registry.registry import Registry, sha256_of
 from service.store.run_directory import Published, RunDirectory
 
 
@@ -75,11 +73,11 @@ def publish_run(
     Raises:
         StorageError: see ``Registry.publish``; or the run directory cannot be written.
     """
-    version, parent = newest_if_same(registry, config.name, parameters), None
-    if version is None:
-        parent = _published_before(directory, registry)
-        if parent is not None and parent.name == config.name and _has(registry, parent, parameters):
-            version = parent  # others have published under this name since
+    parent = _published_before(directory, registry)
+    candidates = registry.versions(config.name)[-1:]
+    if parent is not None and parent.name == config.name:
+        candidates.append(parent)  # others may have published under this name since
+    version = next((each for each in candidates if _has(registry, each, parameters)), None)
     if version is None:
         known = directory.history
         history = known.model_dump(mode="json") if known is not None and known.events else None
@@ -127,9 +125,9 @@ def check_publishable(config: Config, registry: Path | str) -> None:
     for place in (target, Registry(BUNDLED)):  # of either, NAME@latest would come to mean something else
         for version in place.versions(config.name)[-1:]:
             with contextlib.suppress(StorageError):  # a damaged version is mended by publishing again
-                kind = place.manifest(str(version)).spaces.get("kind", PRIMITIVES)
+                kind = place.manifest(str(version)).spaces.get("kind", "primitives")
                 if config.makes not in (None, kind):
-                    what = f"an {kind}" if kind == ORCHESTRATOR else kind
+                    what = f"an {kind}" if kind == "orchestrator" else kind
                     raise TandemError(f"{config.name} is the name of {what} already: choose another name")
     if not isinstance(config, TaskConfig):
         return
@@ -148,7 +146,7 @@ def _described(config: Config) -> dict[str, Any]:
     if isinstance(config, TaskConfig):
         spaces = {
             **seen.spaces,
-            "kind": ORCHESTRATOR,
+            "kind": "orchestrator",
             "task": config.task,
             "task_version": config.task_version,
             "method": config.method,
@@ -164,17 +162,11 @@ def _described(config: Config) -> dict[str, Any]:
         }
     if isinstance(config, SkillDiscoveryConfig):
         shared = {name: size for name, size in SPACES.items() if name != "observation"}
-        normalisation, spaces = POSITIONS.normalisation, {**shared, "kind": SKILLS, "skill": config.skills.size}
+        normalisation, spaces = POSITIONS.normalisation, {**shared, "kind": "skills", "skill": config.skills.size}
     else:
         normalisation, spaces = seen.bob.normalisation, seen.spaces
     constants = {"offset": normalisation.offset.tolist(), "scale": normalisation.scale.tolist()}
     return {"spaces": spaces, "normalisation": constants}
-
-
-def newest_if_same(registry: Registry, name: str, parameters: Parameters) -> Version | None:
-    """The newest version, if it has these parameters: what is published again must not become another version."""
-    newest = registry.versions(name)[-1:]
-    return newest[0] if newest and _has(registry, newest[0], parameters) else None
 
 
 def _has(registry: Registry, version: Version, parameters: Parameters) -> bool:

@@ -14,6 +14,7 @@ A publish writes the blob, then the manifest, then the aliases, each atomically:
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import os
 from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
@@ -23,21 +24,23 @@ from typing import Any
 import numpy as np
 
 from service.base import tensors
-from service.base.errors import RegistryError, StorageError, UnknownVersionError, did_you_mean
+from service.base.errors import DamagedBlobError, RegistryError, StorageError, UnknownVersionError, did_you_mean
 from service.base.files import open_to_append, os_errors, read_regular, write_atomic, write_exclusive
 from service.base.version import git_commit
 from service.registry import names
-from service.registry.blobs import BlobStore, sha256_of
 from service.registry.manifest import Manifest, make_manifest, read_manifest
 from service.registry.names import LATEST, Version
 
 MAX_ALIAS_BYTES = 100
 """Of an alias' file, which holds a number."""
+MAX_BLOB_BYTES = 1024**3
+"""The largest primitives there are have about a megabyte."""
 READ_ONLY_FILE = "READ_ONLY"
 EXPORTED_MANIFEST, EXPORTED_PARAMETERS = "manifest.json", "primitives.safetensors"
 """Files of an exported version."""
 Check = Callable[[Manifest, Mapping[str, np.ndarray]], Iterable[str]]
 """Tells in a line each what is wrong with a manifest and its arrays."""
+_MEND = "restore the file from a copy, or publish the same parameters again"
 
 
 class Registry:
@@ -48,7 +51,6 @@ class Registry:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.blobs = BlobStore(root / "blobs")
 
     def check_writable(self) -> None:
         """Check that this registry may be written.
@@ -146,7 +148,7 @@ class Registry:
             StorageError: as for `manifest`; DamagedBlobError also for damaged parameters.
         """
         manifest = self.manifest(reference)
-        return manifest, tensors.decode(self.blobs.get(manifest.blob_sha256))
+        return manifest, tensors.decode(self.get_blob(manifest.blob_sha256))
 
     def names(self) -> list[str]:
         """Every name that has a version, sorted.
@@ -222,7 +224,7 @@ class Registry:
         """
         manifest, _ = self.load(reference)
         files = {
-            directory / EXPORTED_PARAMETERS: self.blobs.get(manifest.blob_sha256),
+            directory / EXPORTED_PARAMETERS: self.get_blob(manifest.blob_sha256),
             directory / EXPORTED_MANIFEST: manifest.to_bytes(),
         }
         for path in files:
@@ -232,6 +234,39 @@ class Registry:
             write_atomic(path, data)
         return manifest
 
+    def blob_path(self, digest: str) -> Path:
+        """File of the bytes of that sha256 in hex, there or not."""
+        return self.root / "blobs" / "sha256" / digest
+
+    def put_blob(self, data: bytes) -> str:
+        """Store bytes and return their sha256 in hex; what is already there and whole is not written again.
+
+        Raises:
+            StorageError: the disk is full or cannot be written; nothing is left behind.
+        """
+        digest = sha256_of(data)
+        try:
+            self.get_blob(digest)
+        except DamagedBlobError:  # or not there yet
+            write_atomic(self.blob_path(digest), data)
+        return digest
+
+    def get_blob(self, digest: str) -> bytes:
+        """The bytes of that sha256 in hex, verified.
+
+        Raises:
+            DamagedBlobError: the file is missing or holds other bytes.
+            StorageError: the file cannot be read.
+        """
+        path = self.blob_path(digest)
+        with os_errors("read", path):
+            try:
+                data = read_regular(path, MAX_BLOB_BYTES, follow=True)
+            except FileNotFoundError:
+                raise DamagedBlobError(f"blob {path} is missing; {_MEND}") from None
+        check_digest(path, data, digest)
+        return data
+
     def _publish_version(self, name: str, parameters: Mapping[str, np.ndarray], fields: dict[str, Any]) -> Version:
         try:
             data = tensors.encode(parameters)
@@ -239,7 +274,7 @@ class Registry:
             raise RegistryError(f"cannot publish {name}: {error}") from None
         fields |= {"blob_sha256": sha256_of(data), "blob_bytes": len(data)}
         make_manifest({**fields, "version": 1})  # a bad value must be found before anything is written
-        self.blobs.put(data)
+        self.put_blob(data)
         while True:
             # unique: only one writer makes number n; contiguous: no writer tries n + 1 before n is there
             version = Version(name, max((last.number for last in self.versions(name)), default=0) + 1)
@@ -316,3 +351,18 @@ class Registry:
 
     def _alias_directory(self, name: str) -> Path:
         return self._directory(name) / "aliases"
+
+
+def check_digest(place: Path | str, data: bytes, digest: str) -> None:
+    """Check that the bytes read from ``place`` are those of ``digest``.
+
+    Raises:
+        DamagedBlobError: they are not.
+    """
+    if (actual := sha256_of(data)) != digest:
+        raise DamagedBlobError(f"{place} is damaged: expected sha256 {digest}, it has {actual}; {_MEND}")
+
+
+def sha256_of(data: bytes) -> str:
+    """The sha256 of ``data`` in hex."""
+    return hashlib.sha256(data).hexdigest()

@@ -14,7 +14,6 @@ from service.base.types import StateArray
 from service.config.frozen import FrozenModel
 from service.config.world import WorldConfig
 from service.envs.batch import MAX_SPEED, MAX_TURN_RAD, WorldBatch
-from service.envs.kinematics import Kinematics
 from service.robot.backends import Backend, ExactPoses
 from service.robot.interface import Command, RobotState
 
@@ -67,7 +66,6 @@ class MujocoRobot:
         self._stopped = False
         self._last: tuple[float, StateArray | None] = (0.0, None)
         """When the joints got their last set-points, and which, before they were moved on."""
-        self._known: tuple[float, Kinematics] | None = None
         self._grip = self.model.actuator_forcerange[self._fingers].copy()
         self.reset(self._start[self._layout["object"]])
 
@@ -89,7 +87,7 @@ class MujocoRobot:
     def read(self) -> RobotState:
         """The robot as it is."""
         fingers = self._robot.openings(self._data.qpos[None, self._fingers])[0]
-        return RobotState(self.now_s(), self._here().position[0].copy(), fingers)
+        return RobotState(self.now_s(), self._robot.arm.forward(self._joints()).position[0], fingers)
 
     def command(self, command: Command) -> None:
         """Send the servos to a set-point, as in training; after ``stop``, refuse until ``reset``.
@@ -101,7 +99,7 @@ class MujocoRobot:
             raise RobotError("robot mujoco: it was stopped, and takes no commands until its next start")
         joints = self._joints()
         target = self._reach.clip(np.array(command.effector_m, dtype=np.float64)[None])
-        solution = self._led(self._robot.arm.solve(joints, target, at=self._here()))
+        solution = self._led(self._robot.arm.solve(joints, target))
         self._data.ctrl[: self._robot.num_joints] = np.clip(solution, joints - MAX_TURN_RAD, joints + MAX_TURN_RAD)[0]
         width_m = np.clip([command.width_m], 0.0, self._widest_m)
         self._data.ctrl[self._fingers] = self._robot.finger_values(width_m)[0]
@@ -144,7 +142,7 @@ class MujocoRobot:
         state[layout["object"]] = object_m
         mujoco.mj_setState(self.model, self._data, state[layout.physics], mujoco.mjtState.mjSTATE_FULLPHYSICS)
         self._data.time, self._stopped = now_s, False
-        self._last, self._known = (now_s, None), None
+        self._last = (now_s, None)
         self._data.qacc_warmstart[:] = 0.0
         num = self._fingers.stop
         self._data.ctrl[:num] = self._data.qpos[:num]
@@ -154,12 +152,6 @@ class MujocoRobot:
         """(3,) where the object is, metres."""
         position: StateArray = self._data.qpos[self._fingers.stop :][:3].copy()
         return position
-
-    def _here(self) -> Kinematics:
-        """Where the arm is now; reading it and solving for the next set-point both ask."""
-        if self._known is None or self._known[0] != self._data.time:
-            self._known = (self._data.time, self._robot.arm.forward(self._joints()))
-        return self._known[1]
 
     def _joints(self) -> StateArray:
         """(1, J)."""

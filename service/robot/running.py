@@ -19,17 +19,15 @@ from service.base.types import StateArray
 from service.config.frozen import first_error
 from service.config.world import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.sampling import Places, draw_goals, draw_objects, inside_fixtures
+from service.envs.sampling import Places, draw_goals, draw_objects
 from service.media.recording import RecordedEpisodes
 from service.methods.compose import check_robot
 from service.registry.loading import Trained
 from service.robot.backends import Backend
-from service.robot.limits import Box
 from service.robot.loop import Bridge
 
 FORMAT_VERSION = 1
 """Of a log."""
-_ROUNDING_M = 1e-6
 _LONG_WAY = 30
 """Iterations that find the arm's joints from its home."""
 
@@ -58,28 +56,6 @@ def for_robot(trained: Trained) -> Trained:
     if found.world.num_observed_obstacles:
         raise TandemError(f"{found.label} observes obstacles, and the bridge measures the object alone; train without")
     return found
-
-
-def parse_goal(text: str, world: WorldConfig) -> StateArray:
-    """(3,) a goal written as ``x,y,z``, metres.
-
-    Raises:
-        TandemError: no three numbers, outside the box of training, or where the object would be inside a fixture.
-    """
-    try:
-        goal = np.array([float(part) for part in text.split(",")])
-    except ValueError:
-        goal = np.empty(0)
-    if goal.shape != (3,) or not np.isfinite(goal).all():
-        raise TandemError(f"--goal {text!r}: expected x,y,z in metres, such as -0.05,0.1,0.2")
-    lower, upper = np.array(world.workspace.lower_m), np.array(world.workspace.upper_m)
-    lower[2] = world.rest_height_m
-    box = Box(lower, upper)
-    if not box.contains(goal, margin_m=_ROUNDING_M):
-        raise TandemError(f"--goal {text}: outside the box that the policy was trained in: {box}")
-    if inside_fixtures(goal[None], world)[0]:
-        raise TandemError(f"--goal {text}: the object would be inside a fixture, or the upright box around it")
-    return goal
 
 
 def play(
@@ -142,8 +118,8 @@ def _goal_from(backend: Backend, rng: np.random.Generator, policy: Trained) -> S
 # --- the log ---------------------------------------------------------------------------------------------------------
 
 
-class RobotLog:
-    """Writes a log.
+def open_log(path: Path, header: Mapping[str, Any], world: WorldConfig) -> JsonlWriter:
+    """Begin a log, to which steps are appended as ``loop.Bridge.run`` has them, each with its ``episode``.
 
     Args:
         path: a file that is not there yet.
@@ -153,18 +129,11 @@ class RobotLog:
     Raises:
         TandemError: the file is there, or cannot be written.
     """
-
-    def __init__(self, path: Path, header: Mapping[str, Any], world: WorldConfig) -> None:
-        if path.exists():
-            raise TandemError(f"--log {path}: there is a file already; name another")
-        self._writer = JsonlWriter(path)
-        self._writer.append({"format_version": FORMAT_VERSION, **header, "world": world.model_dump(mode="json")})
-        self.episode = 0
-        """Number that steps are logged under."""
-
-    def record(self, row: Mapping[str, Any]) -> None:
-        """Add a step; see ``loop.Bridge.run``."""
-        self._writer.append({"episode": self.episode, **row})
+    if path.exists():
+        raise TandemError(f"--log {path}: there is a file already; name another")
+    log = JsonlWriter(path)
+    log.append({"format_version": FORMAT_VERSION, **header, "world": world.model_dump(mode="json")})
+    return log
 
 
 def read_log(path: Path) -> tuple[WorldConfig, RecordedEpisodes]:

@@ -48,7 +48,7 @@ def primitives_router(registry: Registry) -> APIRouter:
     @lru_cache(MAX_VERIFIED)
     def verify(place: Registry, digest: str, *_stamp: int) -> None:
         # once for each state of the file: clients cache blobs for ever, so a damaged one must never be served
-        place.blobs.get(digest)
+        place.get_blob(digest)
 
     @router.get("/primitives", summary="All names")
     def list_primitives() -> PrimitiveList:
@@ -87,7 +87,7 @@ def primitives_router(registry: Registry) -> APIRouter:
     def get_blob(request: Request, digest: _Digest) -> Response:
         """Checked against the digest, which is also the entity tag; a blob never changes."""
         for place in reversed(shelf.registries.values()):
-            path = place.blobs.path(digest)
+            path = place.blob_path(digest)
             try:
                 status = os.stat(path)
             except FileNotFoundError:

@@ -13,7 +13,7 @@ from pathlib import Path
 import uvicorn
 
 from service.base.errors import StatusError
-from service.base.ports import DEFAULT_PORT, listen
+from service.base.ports import DEFAULT_PORT, listen, url_of
 from service.registry.registry import Registry
 from service.status.app import create_app
 from service.status.auth import is_loopback
@@ -57,7 +57,7 @@ class StatusServer:
         except StatusError:
             self._socket.close()
             raise
-        self.url = f"http://{_reachable(address)}:{self.port}"
+        self.url = url_of(address, self.port)
         """URL for clients on this machine."""
         self.app = app
         config = uvicorn.Config(
@@ -140,8 +140,3 @@ def _listen(host: str, port: int) -> socket.socket:
         else:
             reason = f"cannot listen at {host!r} port {port}: {error}; name an address of this machine with --host"
         raise StatusError(reason) from None
-
-
-def _reachable(address: str) -> str:
-    address = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(address, address)
-    return f"[{address}]" if ":" in address else address

@@ -7,10 +7,9 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from service.base.errors import TandemError, needs_extra
-from service.cli.main import app
+from tests.cli.typed import assert_refused, tandem
 from tests.runs.runs import assert_one_line
 
 ROOT = Path(__file__).parents[2]
@@ -42,9 +41,8 @@ def test_a_command_says_which_one_to_install(tmp_path, monkeypatch, without, pac
     ours, arguments, said, extra = WITHOUT[package]
     monkeypatch.chdir(tmp_path)
     without(package, ours=[f"service.{name}" for name in ours])
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 2, result.output
-    assert_one_line(result.stderr, said, f"the package {package}, which is not installed", f"'tandem-skills[{extra}]'")
+    missing = f"the package {package}, which is not installed"
+    assert_refused(tandem(*arguments), said, missing, f"'tandem-skills[{extra}]'")
 
 
 def test_what_fetches_says_which_one_to_install(without):

@@ -11,7 +11,6 @@ from service.base.errors import TandemError
 from service.config import parse_config
 from service.config.skills import SkillsConfig
 from service.policies.frozen_skills import FrozenSkills
-from service.registry.loading import read_stages
 from service.store.run_directory import RunDirectory
 from tests.methods.test_skill_run import play, small_config
 from tests.runs.runs import TREE
@@ -38,7 +37,7 @@ def test_a_skill_run_is_recorded(tmp_path):
     assert {name: stage.get("env_steps") for name, stage in found.items()} == {
         "random policy": None, "beginning": 0, "middle": 200, "end": 400
     }  # fmt: skip
-    newest = FrozenSkills(read_stages(RunDirectory(tmp_path))[400], SkillsConfig(method="dads"))
+    newest = FrozenSkills(record_run.read_stages(RunDirectory(tmp_path))[400], SkillsConfig(method="dads"))
     paths = skill_paths(newest, config.world, num_skills=32, num_steps=8, seed=0)
     assert found["end"]["shares"][0] == round(visited_share(paths, config.world.workspace), 4)
     np.testing.assert_allclose(run_files.paths_m(found["end"]), paths[:, ::4], atol=0.0005)

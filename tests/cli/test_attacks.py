@@ -11,11 +11,10 @@ from contextlib import contextmanager
 from itertools import pairwise
 
 import pytest
-from typer.testing import CliRunner
 
-from service.cli.main import app
 from service.registry.publishing import publish
 from service.registry.registry import Registry
+from tests.cli.typed import tandem
 from tests.runs.runs import begin_study, play, tiny_config, write_yaml
 
 LIMIT_S = 60
@@ -86,7 +85,7 @@ def soon():
 def refuse(arguments):
     """Run a command that has to end with one line; returns it."""
     with soon():
-        result = CliRunner().invoke(app, arguments, env={"COLUMNS": "80"})
+        result = tandem(*arguments)
     assert result.exit_code == (1 if "verify" in arguments else 2), (result.stderr, result.exception)
     assert result.stderr.count("\n") == 1, result.stderr
     assert result.stderr.endswith("\n")

@@ -3,16 +3,14 @@
 import json
 import re
 
-from typer.testing import CliRunner
-
 import service
 from service.base.errors import TandemError
 from service.cli import doctor
-from service.cli.main import app
+from tests.cli.typed import tandem
 
 
 def asked(*options):
-    done = CliRunner().invoke(app, ["doctor", *options])
+    done = tandem("doctor", *options)
     assert done.exit_code == 0, done.output
     return done.output
 

@@ -10,13 +10,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from typer.testing import CliRunner
 
 import service
 from service.base.errors import TandemError
 from service.base.lock import DirectoryLock
 from service.cli.evaluate import parse_goals
-from service.cli.main import app
 from service.config import WorldConfig, load_config
 from service.config.recipes import recipes
 from service.methods import task_evaluation  # noqa: F401  before the function that it calls is replaced
@@ -26,6 +24,7 @@ from service.runs.signals import InterruptError
 from service.runs.study import Study
 from service.runs.study_run import Place
 from service.store.run_directory import RunDirectory
+from tests.cli.typed import assert_refused, tandem
 from tests.runs.runs import TREE, assert_one_line, no_room_above, tiny_config, write_yaml
 
 ROOT = Path(__file__).parents[2]
@@ -34,21 +33,6 @@ EVALUATION_KEYS = {
     "goals", "num_episodes", "num_steps", "success_last", "success_last_low", "success_last_high", "success_ever",
     "mean_distance_m",
 }  # fmt: skip
-
-
-def tandem(*arguments, **environment):
-    """Run a command in this process."""
-    return CliRunner().invoke(app, [str(argument) for argument in arguments], env={"COLUMNS": "80", **environment})
-
-
-def assert_user_error(result, *parts):
-    """Exit code 2, and one line on stderr that has all of this in it."""
-    assert result.exit_code == 2, result.exception
-    assert result.stdout == ""
-    assert result.stderr.startswith("error: ")
-    assert result.stderr.count("\n") == 1, result.stderr
-    assert result.stderr.endswith("\n")
-    assert [part for part in parts if str(part) not in result.stderr] == [], result.stderr
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +76,7 @@ def test_pretrain_leaves_everything_a_person_looks_at_and_says_where(trained):
     ):
         assert word in out
     before = (trained.run / "metrics.jsonl").read_bytes()
-    assert_user_error(tandem("pretrain", "--run-dir", trained.run), trained.run, "--resume")
+    assert_refused(tandem("pretrain", "--run-dir", trained.run), trained.run, "--resume")
     assert (trained.run / "metrics.jsonl").read_bytes() == before
 
 
@@ -184,7 +168,7 @@ def test_demo_is_a_short_pretraining_with_a_registry_of_its_own(asked):
     assert (configs[0].run.evaluation_interval, configs[0].run.checkpoint_interval) == (60, 10)
     (one / "config.yaml").touch()
     refused = tandem("demo", "--run-dir", one)
-    assert_user_error(refused, "or continue with: tandem train --resume --run-dir runs/demo-1", "runs/demo-1/registry")
+    assert_refused(refused, "or continue with: tandem train --resume --run-dir runs/demo-1", "runs/demo-1/registry")
 
 
 @pytest.mark.parametrize(
@@ -233,12 +217,11 @@ def test_demo_ends_when_bob_is_good_twice_in_a_row_or_the_time_is_over(monkeypat
 def test_what_is_wrong_with_the_directory_or_with_ray_is_said_and_leaves_nothing(tmp_path, monkeypatch, seeds):
     arguments = ("pretrain", "--run-dir", tmp_path / "run", *seeds, "--runtime", "ray")
     result = tandem(*arguments, "--address", "127.0.0.1:1")
-    assert result.exit_code == 1
-    assert_one_line(result.stderr, "error: --address 127.0.0.1:1: no Ray cluster answers there")
+    assert_refused(result, "error: --address 127.0.0.1:1: no Ray cluster answers there", code=1)
     assert list(tmp_path.iterdir()) == []
     monkeypatch.setattr("service.cluster.ray_connection.connected", lambda address: pytest.fail("it takes a minute"))
     lock = DirectoryLock(tmp_path / "run", "")
-    assert_user_error(tandem(*arguments, "--status", "off"), tmp_path / "run", f"in use by process {os.getpid()} on ")
+    assert_refused(tandem(*arguments, "--status", "off"), tmp_path / "run", f"in use by process {os.getpid()} on ")
     lock.release()
 
 
@@ -303,7 +286,7 @@ def test_episodes_are_as_long_as_the_run_evaluated_them(trained):
 
 def test_evaluate_in_a_world_of_another_layout_is_refused(trained):
     result = evaluate(trained, "tiny", "--set", "world.observed.num_commands=1")
-    assert_user_error(result, "--set", "tiny@1", "command_1", "world.observed")
+    assert_refused(result, "--set", "tiny@1", "command_1", "world.observed")
     assert evaluate(trained, "tiny", "--set", "world.randomisation.delay_steps=[1,1]").exit_code == 0
 
 
@@ -374,7 +357,7 @@ def test_render_films_goals_that_are_typed(trained, monkeypatch, tmp_path):
     ("arguments", "part"),
     [
         (["--goals", "lift"], "--goals 'lift': write one of table, air, mixed, volume, one, or points"),
-        (["--goals", "0.1,nan,0.2"], "or points x,y,z in metres"),
+        (["--goals", "0.1,nan,0.2"], "or points with ; between, each x,y,z in metres"),
         (["--goals", "0.1,0,0.2;0.9,0,0.1"], "0.900, 0.000, 0.100 is outside of the workspace"),
         (["--size", "641x360"], "--size '641x360': write WIDTHxHEIGHT, even numbers"),
         (["--camera", "moon"], "camera 'moon': there is none"),
@@ -384,7 +367,7 @@ def test_render_films_goals_that_are_typed(trained, monkeypatch, tmp_path):
 )
 def test_a_film_that_cannot_be_made(arguments, part, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert_user_error(tandem("render", *arguments), part)
+    assert_refused(tandem("render", *arguments), part)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -401,7 +384,6 @@ def test_a_goal_of_a_film_is_in_no_fixture():
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        (["--set", "learner.bob.num_epoch=3"], ["learner.bob.num_epoch", "num_epochs"]),
         (["--set", "game.num_worlds=0"], ["game.num_worlds", "0"]),
         (["--set", "world.object=bunny"], ["world.object", "bunny"]),
         (["--set", "name=No Name"], ["name", "No Name"]),
@@ -421,7 +403,7 @@ def test_mistakes_of_pretrain(trained, monkeypatch, tmp_path, arguments, parts):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     names = {"RUN": trained.run, "OTHER": write_yaml(trained.home / "other.yaml", TREE | {"seed": 3})}
-    assert_user_error(tandem("pretrain", *(names.get(each, each) for each in arguments)), *parts)
+    assert_refused(tandem("pretrain", *(names.get(each, each) for each in arguments)), *parts)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -431,17 +413,13 @@ def test_a_resume_without_a_checkpoint(tmp_path):
     directory.close()
     for file in (tmp_path / "checkpoints").iterdir():
         file.unlink()
-    assert_user_error(tandem("pretrain", "--resume", "--run-dir", tmp_path), "no checkpoint in", tmp_path)
+    assert_refused(tandem("pretrain", "--resume", "--run-dir", tmp_path), "no checkpoint in", tmp_path)
 
 
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        (["evaluate", "tiny@best"], ["no alias 'best'", "latest -> 1"]),
-        (["evaluate", "tiny@2"], ["no version 2"]),
-        (["evaluate", "nobody"], ["no 'nobody'", "it holds: tiny", "with tandem comes: panda-cube"]),
         (["evaluate", "no/where"], ["no/where", "no such directory of a run"]),
-        (["evaluate", "tiny", "--goals", "sky"], ["'sky'", "table, air, mixed"]),
         (["coverage", "tiny", "--skills", "2", "--steps", "1", "--out", "file/x.png"], ["file/x.png"]),
         (["coverage", "tiny", "--out", "x.txt"], ["--out x.txt", "ends in .png"]),
     ],
@@ -449,14 +427,14 @@ def test_a_resume_without_a_checkpoint(tmp_path):
 def test_mistakes_of_the_others(trained, monkeypatch, tmp_path, arguments, parts):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
-    assert_user_error(tandem(*arguments, TANDEM_REGISTRY=str(trained.registry)), *parts)
+    assert_refused(tandem(*arguments, TANDEM_REGISTRY=str(trained.registry)), *parts)
 
 
 def test_a_full_disk_during_a_checkpoint(tmp_path, full_disk):
     config = write_yaml(tmp_path / "tiny.yaml")
     full_disk("fsync")
     result = tandem("pretrain", "--config", config, "--run-dir", tmp_path / "run", "--registry", tmp_path / "registry")
-    assert_user_error(result, "checkpoint-", "No space left on device")
+    assert_refused(result, "checkpoint-", "No space left on device")
 
 
 def test_a_disk_that_is_full_to_the_end(tmp_path):
@@ -478,4 +456,4 @@ def test_a_method_makes_a_run_of_skills_under_its_own_name(asked):
         *("dads", "panda-cube-dads", 3, "panda-cube-dads"),
     )
     assert [config.skills.hidden_sizes for config, *_ in asked] == [(64, 64), (256, 256), (32,)]
-    assert_user_error(tandem("pretrain", "--method", "ppo"), "method = 'ppo'", "lsd, dads, diayn, metra")
+    assert_refused(tandem("pretrain", "--method", "ppo"), "method = 'ppo'", "lsd, dads, diayn, metra")

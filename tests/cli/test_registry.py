@@ -3,19 +3,19 @@
 import json
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 import service
-from service.cli.main import app
 from service.cli.registry import registry_app
 from service.registry.bundled import BUNDLED
 from service.registry.loading import parameters_digest
 from service.registry.manifest import parse_manifest
 from service.registry.registry import Registry
+from tests.cli.typed import assert_refused, tandem
 from tests.registry.helpers import Publish, files_in
 
 Run = Callable[..., Any]
@@ -27,20 +27,7 @@ def run(registry: Registry, publish: Publish) -> Run:
     publish()
     publish(value=1.0, parent="panda-cube@1")
 
-    def _run(*arguments: str) -> Any:
-        return CliRunner().invoke(registry_app, list(arguments), env={"TANDEM_REGISTRY": str(registry.root)})
-
-    return _run
-
-
-def assert_user_error(result: Any, *parts: str) -> None:
-    """One line on stderr, exit code 2."""
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    assert result.stderr.count("\n") == 1
-    assert result.stderr.startswith("error: ")
-    for part in parts:
-        assert part in result.stderr
+    return partial(tandem, "registry", TANDEM_REGISTRY=str(registry.root))
 
 
 def test_list(run: Run) -> None:
@@ -69,7 +56,7 @@ def test_list_has_the_other_versions_beside_a_damaged_one(run: Run, registry: Re
 @pytest.mark.parametrize("directory", [".", "none"])
 def test_list_of_an_empty_registry_has_what_comes_with_tandem(tmp_path: Path, directory: str) -> None:
     path = tmp_path / directory
-    result = CliRunner().invoke(registry_app, ["list", "--json", "--registry", str(path)])
+    result = tandem("registry", "list", "--json", "--registry", path)
     assert result.exit_code == 0
     assert result.stderr == f"nothing published in {path} yet\n"
     rows = json.loads(result.stdout)
@@ -80,10 +67,7 @@ def test_list_of_an_empty_registry_has_what_comes_with_tandem(tmp_path: Path, di
 
 
 def test_what_comes_with_tandem_is_listed_once_shown_verified_and_exported_but_not_changed(tmp_path: Path) -> None:
-    def run(*arguments: object) -> Any:
-        return CliRunner().invoke(registry_app, [str(argument) for argument in arguments])
-
-    own = ("--registry", tmp_path / "none")
+    run, own = partial(tandem, "registry"), ("--registry", tmp_path / "none")
     assert len(json.loads(run("list", "--json", "--registry", BUNDLED).stdout)) == len(Registry(BUNDLED).names())
     tree = json.loads(run("show", "panda-cube@champion", "--json", *own).stdout)
     assert (tree["name"], tree["aliases"], tree["where"]) == ("panda-cube", ["champion", "latest"], "bundled")
@@ -92,8 +76,8 @@ def test_what_comes_with_tandem_is_listed_once_shown_verified_and_exported_but_n
     assert parse_manifest((tmp_path / "out" / "manifest.json").read_bytes(), tmp_path) == Registry(BUNDLED).manifest(
         "panda-cube"
     )
-    assert_user_error(run("alias", "panda-cube", "best", *own), "cannot write", str(BUNDLED), "only read")
-    assert_user_error(run("verify", *own), "no registry at", "--registry")
+    assert_refused(run("alias", "panda-cube", "best", *own), "cannot write", str(BUNDLED), "only read")
+    assert_refused(run("verify", *own), "no registry at", "--registry")
 
 
 def test_show(run: Run) -> None:
@@ -124,17 +108,9 @@ def test_alias(run: Run, registry: Registry) -> None:
     assert registry.aliases("panda-cube") == {"champion": 1, "latest": 2}
 
 
-def test_export(run: Run, tmp_path: Path) -> None:
-    assert run("export", "panda-cube@1", str(tmp_path / "out")).exit_code == 0
-    assert parse_manifest((tmp_path / "out" / "manifest.json").read_bytes(), tmp_path).version == 1
-
-
 def test_what_is_exported_is_a_version_for_every_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-
-    def tandem(*arguments: object) -> Any:
-        return CliRunner().invoke(app, [*map(str, arguments), "--registry", "none"])
-
+    monkeypatch.setenv("TANDEM_REGISTRY", "none")
     assert tandem("registry", "export", "panda-cube@champion", "given").exit_code == 0
     tree = json.loads(tandem("registry", "show", "given", "--json").stdout)
     champion = Registry(BUNDLED).manifest("panda-cube@champion")
@@ -149,7 +125,7 @@ def test_what_is_exported_is_a_version_for_every_command(tmp_path: Path, monkeyp
     assert played[0] == played[1]
     assert list(played[0]) == [champion.reference, "idle"]
     assert list(played[0].values()) == list(played[2].values())
-    assert_user_error(tandem("registry", "alias", "given", "best"), "cannot write given", "only read")
+    assert_refused(tandem("registry", "alias", "given", "best"), "cannot write given", "only read")
     downstream = service.load("given")
     assert parameters_digest(downstream.policy) == parameters_digest(service.load().policy)
 
@@ -175,20 +151,17 @@ def test_verify(run: Run, registry: Registry) -> None:
 
 
 def test_mistakes_are_one_line_and_exit_code_2(run: Run, tmp_path: Path) -> None:
-    assert_user_error(run("show", "panda-cube@best"), "no alias 'best'", "latest -> 2", "champion -> ")
-    assert_user_error(run("show", "panda-cup"), "it holds: panda-cube")
-    assert_user_error(run("alias", "panda-cube", "7"), "bad alias '7'")
-    assert_user_error(run("verify", "../x"), "bad reference")
-    assert_user_error(
-        run("show", "nobody", "--registry", str(tmp_path / "none")), "none", "with tandem comes: panda-cube"
-    )
+    assert_refused(run("show", "panda-cube@best"), "no alias 'best'", "latest -> 2", "champion -> ")
+    assert_refused(run("show", "panda-cup"), "it holds: panda-cube")
+    assert_refused(run("alias", "panda-cube", "7"), "bad alias '7'")
+    assert_refused(run("verify", "../x"), "bad reference")
+    assert_refused(run("show", "nobody", "--registry", str(tmp_path / "none")), "none", "with tandem comes: panda-cube")
     (tmp_path / "manifest.json").write_text("")
-    assert_user_error(run("export", "panda-cube", str(tmp_path)), "exists")
+    assert_refused(run("export", "panda-cube", str(tmp_path)), "exists")
     assert run("show").exit_code == 2
 
 
 @pytest.mark.parametrize("command", [["list"], ["show", "tiny"]])
 def test_a_service_is_no_directory(command):
-    refused = CliRunner().invoke(registry_app, [*command, "--registry", "http://127.0.0.1:9"])
-    assert refused.exit_code == 2
-    assert "is a service; give the directory of a registry" in " ".join(refused.output.replace("\u2502", " ").split())
+    refused = tandem("registry", *command, "--registry", "http://127.0.0.1:9")
+    assert_refused(refused, "is a service; give the directory of a registry")

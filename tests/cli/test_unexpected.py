@@ -9,10 +9,9 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from service.cli.main import app
-from tests.runs.runs import assert_one_line, write_yaml
+from tests.cli.typed import assert_refused, tandem
+from tests.runs.runs import write_yaml
 
 ROOT = Path(__file__).parents[2]
 SAID = re.compile(r"error: unexpected KeyError: 'x\\ny\\x1b'; its traceback is in (\S+), please report it\n")
@@ -32,8 +31,7 @@ def temporary(tmp_path, monkeypatch):
 
 def pretrain(tmp_path):
     config = write_yaml(tmp_path / "tiny.yaml")
-    arguments = ["pretrain", "--config", config, "--run-dir", tmp_path / "run", "--registry", tmp_path / "registry"]
-    return CliRunner().invoke(app, [str(each) for each in arguments])
+    return tandem("pretrain", "--config", config, "--run-dir", tmp_path / "run", "--registry", tmp_path / "registry")
 
 
 def check(result, directory):
@@ -65,16 +63,15 @@ def test_of_a_run_without_a_directory_it_is_a_temporary_file(tmp_path, monkeypat
 
 def test_every_other_command_leaves_a_temporary_file(monkeypatch, temporary):
     monkeypatch.setattr("service.registry.registry.Registry.names", fail)
-    runs = [CliRunner().invoke(app, ["registry", "list"]) for _ in range(2)]
+    runs = [tandem("registry", "list") for _ in range(2)]
     assert len({check(result, temporary) for result in runs}) == 2  # nothing is written over
 
 
 def test_where_no_file_can_be_written_the_line_says_where_it_happened(tmp_path, monkeypatch):
     monkeypatch.setattr("service.registry.registry.Registry.names", fail)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
-    result = CliRunner().invoke(app, ["registry", "list"])
-    assert result.exit_code == 1
-    assert_one_line(result.stderr, "unexpected KeyError", "cannot be written")
+    result = tandem("registry", "list")
+    assert_refused(result, "unexpected KeyError", "cannot be written", code=1)
 
 
 @pytest.mark.parametrize(
@@ -100,9 +97,8 @@ def test_what_is_no_mistake_of_the_program_has_no_traceback(monkeypatch, tempora
         raise error
 
     monkeypatch.setattr("service.registry.registry.Registry.names", fail)
-    result = CliRunner().invoke(app, ["registry", "list"])
-    assert result.exit_code == code
-    assert_one_line(result.stderr, said)
+    result = tandem("registry", "list")
+    assert_refused(result, said, code=code)
     assert len(result.stderr) < 2500
     assert list(temporary.iterdir()) == []
 
@@ -120,7 +116,7 @@ def test_an_interrupt_is_no_error(monkeypatch, temporary):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("service.registry.registry.Registry.names", interrupt)
-    result = CliRunner().invoke(app, ["registry", "list"])
+    result = tandem("registry", "list")
     assert result.exit_code == 130
     assert list(temporary.iterdir()) == []
 
@@ -146,17 +142,15 @@ def test_an_interrupt_is_no_error(monkeypatch, temporary):
 )
 def test_what_is_typed_wrong_is_one_line(monkeypatch, tmp_path, arguments, said):
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 2, result.exception
-    assert result.stderr.startswith("error: ")
-    assert_one_line(result.stderr, said)
+    result = tandem(*arguments)
+    assert_refused(result, said)
     assert len(result.stderr) < 2500
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("arguments", [[], ["registry"]])
 def test_a_group_of_commands_alone_shows_its_help(arguments):
-    result = CliRunner().invoke(app, arguments)
+    result = tandem(*arguments)
     assert result.exit_code == 2
     assert "Usage: " in result.output
     assert "error" not in result.output

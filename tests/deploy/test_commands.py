@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 import typer
-from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.config import dump_config
@@ -16,6 +15,7 @@ from service.runs.study import Study
 from service.runs.study_run import Place
 from service.store.checkpoints import CheckpointStore
 from service.store.run_history import RunHistory
+from tests.cli.typed import tandem
 from tests.deploy.files import DEPLOY, DOCUMENTS, commands, compose, container, manifest, manifests, pod_templates
 
 BEGIN = ("train", "pretrain")
@@ -97,7 +97,7 @@ def test_a_run_begins_with_it_and_goes_on_with_it(arguments, monkeypatch, tmp_pa
     monkeypatch.setattr("service.cluster.ray_connection.connected", lambda *_: nullcontext())
     here, resumed = list(arguments), False
     for resumed in (False, True):
-        result = CliRunner().invoke(app, here)
+        result = tandem(*here)
         assert result.exit_code == 0, result.output
         assert begun.pop() == (Path("runs/study" if "--seeds" in here else "runs/cube"), resumed)
 

@@ -6,17 +6,17 @@ import os
 import re
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from service.base.errors import ParityError
-from service.cli.main import app
 from service.export.exporting import export
 from service.export.measurements import measure, tolerated_late_steps
 from service.registry.bundled import BUNDLED
 from service.registry.loading import load
+from tests.cli.typed import assert_refused, tandem
 from tests.export.policies import MONOLITHIC, SEEN, WORLD, publish_bob, write_run, write_training
 from tests.methods import skill_sets
 from tests.runs.runs import assert_one_line
@@ -28,13 +28,7 @@ def run(registry, tmp_path, monkeypatch):
     publish_bob(registry)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TANDEM_REGISTRY", str(registry.root))
-    return lambda *arguments: CliRunner().invoke(app, ["export", *map(str, arguments)])
-
-
-def fails(result, *parts):
-    assert result.exit_code in (1, 2)
-    assert result.stderr.startswith("error: ")
-    assert_one_line(result.stderr, *parts)
+    return partial(tandem, "export")
 
 
 def described(folder):
@@ -178,19 +172,19 @@ def test_what_does_not_compute_the_same_is_not_left_behind(registry, tmp_path):
 )
 def test_what_cannot_be_done_is_one_line_and_leaves_nothing(arguments, parts, run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
-    fails(run("made", "--out", "out", *arguments), *parts)
+    assert_refused(run("made", "--out", "out", *arguments), *parts)
     assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_that_is_there_is_left_alone(run, tmp_path):
     (tmp_path / "out").mkdir()
-    fails(run("made", "--format", "numpy", "--out", "out"), "cannot write out: it exists")
+    assert_refused(run("made", "--format", "numpy", "--out", "out"), "cannot write out: it exists")
     assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_a_monolithic_bob(run, tmp_path):
     write_run(tmp_path / "alone", MONOLITHIC)
-    fails(run("alone", "--format", "numpy", "--part", "primitives", "--out", "out"), "alone has no primitives")
+    assert_refused(run("alone", "--format", "numpy", "--part", "primitives", "--out", "out"), "alone has no primitives")
     assert run("alone", "--format", "numpy", "--out", "out", "--episodes", 2).exit_code == 0
     about = described(tmp_path / "out")
     assert about["name"] == "made of the run alone"
@@ -200,16 +194,18 @@ def test_a_monolithic_bob(run, tmp_path):
 def test_skills_are_no_bob(run, registry):
     fields = {"spaces": {"kind": "skills"}, "normalisation": {}, "metrics": {}}
     registry.publish("skills", skill_sets.parameters(), config=skill_sets.CONFIG.model_dump(mode="json"), **fields)
-    fails(run("skills", "--format", "numpy", "--out", "out"), "a set of skills of lsd; tandem export needs")
+    assert_refused(run("skills", "--format", "numpy", "--out", "out"), "a set of skills of lsd; tandem export needs")
 
 
 def test_trainings_that_cannot_be_exported(run, registry, tmp_path):
     trained = publish_bob(registry)
     write_training(tmp_path / "scratch", trained, "scratch-monolithic")
-    fails(run("scratch", "--format", "numpy", "--out", "out"), "scratch was trained with", "composes no primitives")
+    assert_refused(
+        run("scratch", "--format", "numpy", "--out", "out"), "scratch was trained with", "composes no primitives"
+    )
     write_training(tmp_path / "begun", trained, "ours")
     champion = ("--primitives", "panda-cube@champion")
-    fails(run("begun", "--format", "numpy", "--out", "out", *champion), "acts with made@1 of digest")
+    assert_refused(run("begun", "--format", "numpy", "--out", "out", *champion), "acts with made@1 of digest")
     assert not (tmp_path / "out").exists()
 
 

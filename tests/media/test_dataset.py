@@ -5,14 +5,13 @@ import json
 import minari
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from service.cli.main import app
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
 from service.envs.gym.tabletop import TabletopEnv
 from service.media.dataset import Played, played_episodes, played_turns, write_dataset
 from service.media.recording import play_rounds, record_episodes
+from tests.cli.typed import assert_refused, tandem
 from tests.media.test_recording import NOTHING, PUSH, Constant
 
 CONFIG = SelfPlayConfig(
@@ -26,10 +25,6 @@ def place(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
     monkeypatch.chdir(tmp_path)
     return tmp_path / "sets"
-
-
-def tandem(*arguments):
-    return CliRunner().invoke(app, ["dataset", *map(str, arguments)])
 
 
 def test_bobs_episodes_are_those_that_the_environment_plays(place):
@@ -75,24 +70,19 @@ def test_rounds_are_turns_of_both():
 
 
 def test_the_command_writes_the_champions_episodes_and_refuses_what_is_there(place):
-    arguments = ("panda-cube@champion", "--episodes", 4, "--goals", "0,0,0.2", "--out", "champion")
+    arguments = ("dataset", "panda-cube@champion", "--episodes", 4, "--goals", "0,0,0.2", "--out", "champion")
     done = tandem(*arguments)
     assert done.exit_code == 0, done.output
     assert done.stdout == f"4 episodes, 200 steps: champion-v0 in {place / 'champion-v0'}\n"
     read = minari.load_dataset("champion-v0")
     last = [episode.infos["is_success"][-1] for episode in read.iterate_episodes()]
     assert sum(last) >= 3  # it reaches 99 % of goals in the air
-    again = tandem(*arguments)
-    assert again.exit_code == 2
-    assert "the data set champion-v0 is there already" in again.stderr
-    assert again.stderr.count("\n") == 1
+    assert_refused(tandem(*arguments), "the data set champion-v0 is there already")
 
 
 @pytest.mark.parametrize("name", ["../up", "panda.cube", "g/cube"])
 def test_a_name_that_is_none_is_refused(place, name):
-    done = tandem("panda-cube@champion", "--episodes", 1, "--out", name)
-    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
-    assert f"--out '{name}': write NAME" in done.stderr
+    assert_refused(tandem("dataset", "panda-cube@champion", "--out", name), f"--out '{name}': write NAME")
 
 
 def test_half_a_data_set_is_taken_away(place):

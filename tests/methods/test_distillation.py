@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from service.actors.distillation import _LEAST_LOG_WEIGHT, _NOISY_SHARE, DistillationWorlds
 from service.base.errors import ConfigError, TandemError
-from service.cli.main import app
 from service.config import parse_config
 from service.config.distillation import DistillationConfig
 from service.envs.batch import WorldBatch
@@ -22,6 +20,7 @@ from service.registry.publishing import publish_run
 from service.registry.registry import Registry
 from service.runs.train import open_run
 from service.store.run_directory import RunDirectory
+from tests.cli.typed import tandem
 from tests.runs.runs import TREE, assert_one_line, assert_same_run, play, read_lines, tiny_config
 
 HOW = {"num_worlds": 8, "episode_steps": 6, "gradient_steps": 3, "batch_size": 16}
@@ -202,7 +201,7 @@ def test_a_run_is_published_with_its_teacher_as_parent_and_is_exact_when_resumed
     start = load(str(version), root / "registry")
     whole = run_to_end(tmp_path / "whole", config, start)
     assert load(str(tmp_path / "whole")).alice is None
-    filmed = CliRunner().invoke(app, ["render", str(tmp_path / "whole"), "--episodes", "1"])
+    filmed = tandem("render", tmp_path / "whole", "--episodes", "1")
     assert filmed.exit_code == 0, filmed.output
     run_to_end(tmp_path / "part", config, start, stop_after=2)
     run_to_end(tmp_path / "part", config, resume=True)

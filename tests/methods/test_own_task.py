@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from service.base.errors import TandemError
-from service.cli.main import app
 from service.config import load_config
 from service.envs.tasks import find_task
 from service.methods.task_check import check_task
@@ -15,6 +13,7 @@ from service.registry.registry import Registry
 from service.runs.resuming import resumed_config
 from service.runs.train import train
 from service.store.run_directory import RunDirectory
+from tests.cli.typed import tandem
 from tests.runs.runs import KilledError, assert_one_line, assert_same_run
 
 pytestmark = pytest.mark.usefixtures("default_signals", "no_video")
@@ -59,8 +58,7 @@ def file(tmp_path, monkeypatch):
 
 def evaluated(reference, registry, *more):
     """What the command prints, and its exit code."""
-    arguments = ["evaluate", str(reference), "--episodes", "4", "--registry", str(registry), *more]
-    done = CliRunner().invoke(app, arguments)
+    done = tandem("evaluate", reference, "--episodes", "4", "--registry", registry, *more)
     return done.output, done.exit_code
 
 

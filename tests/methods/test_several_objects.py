@@ -112,7 +112,7 @@ def test_the_live_world_has_a_goal_for_each(two):
 def test_goals_are_typed_for_all(two):
     found = parse_goals("-0.1,0,0.02,0.05,0.1,0.02", two.world)
     assert found.tolist() == [[-0.1, 0.0, 0.02, 0.05, 0.1, 0.02]]
-    with pytest.raises(TandemError, match="points x,y,z,x,y,z in metres"):
+    with pytest.raises(TandemError, match="points with ; between, each x,y,z,x,y,z in metres"):
         parse_goals("-0.1,0,0.02", two.world)
     with pytest.raises(TandemError, match="outside of the workspace"):
         parse_goals("-0.1,0,0.02,0.9,0.1,0.02", two.world)

@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
-from service.cli.main import app
 from service.registry.bundled import BUNDLED
 from service.registry.card import PAPERS, model_card
 from service.registry.registry import Registry
+from tests.cli.typed import assert_refused, tandem
 from tests.registry.helpers import Publish
 
 BIBLIOGRAPHY = Path(__file__).parents[2] / "docs" / "bibliography.md"
@@ -25,7 +24,7 @@ def parts(card: str) -> tuple[dict, str]:
 
 def test_the_champions_card_says_what_its_manifest_says(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    run = CliRunner().invoke(app, ["registry", "card", "panda-cube@champion", "--out", "README.md"])
+    run = tandem("registry", "card", "panda-cube@champion", "--out", "README.md")
     manifest = Registry(BUNDLED).manifest("panda-cube@champion")
     assert run.stdout == f"the card of {manifest.reference} is in README.md\n"
     head, body = parts(Path("README.md").read_text())
@@ -88,16 +87,13 @@ def test_a_card_says_how_primitives_were_learned():
 
 def test_without_a_file_it_is_printed_and_what_is_not_there_is_refused(tmp_path, registry: Registry, publish: Publish):
     publish()
-    run = CliRunner().invoke(app, ["registry", "card", "panda-cube@1", "--registry", str(registry.root)])
+    run = tandem("registry", "card", "panda-cube@1", "--registry", registry.root)
     assert run.stdout == model_card(registry.manifest("panda-cube@1"))
     for arguments, said in (
         (["panda-cube@77"], "77"),
         (["panda-cube@1", "--out", str(tmp_path)], "cannot write"),
     ):
-        run = CliRunner().invoke(app, ["registry", "card", *arguments, "--registry", str(registry.root)])
-        assert run.exit_code != 0
-        assert run.stderr.count("\n") == 1
-        assert said in run.stderr
+        assert_refused(tandem("registry", "card", *arguments, "--registry", registry.root), said)
 
 
 def test_papers_are_those_of_the_bibliography():

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import subprocess
 import sys
 import threading
@@ -151,14 +152,22 @@ def test_an_array_safetensors_cannot_hold_publishes_nothing(registry: Registry) 
 def test_a_damaged_blob_is_found_and_mended_by_publishing_again(registry: Registry, publish: Publish) -> None:
     publish()
     (blob,) = (registry.root / "blobs" / "sha256").iterdir()
+    written = blob.stat().st_ino
+    publish()
+    assert blob.stat().st_ino == written  # what is whole is not written again
     data = bytearray(blob.read_bytes())
     data[-1] ^= 0x10
     blob.write_bytes(data)
-    with pytest.raises(DamagedBlobError, match=str(blob)):
+    actual = hashlib.sha256(data).hexdigest()
+    said = f"{blob} is damaged: expected sha256 {blob.name}, it has {actual}; restore the file from a copy, or publish"
+    with pytest.raises(DamagedBlobError, match=f"^{re.escape(said)} the same parameters again$"):
         registry.load("panda-cube")
-    assert [problem.partition(":")[0] for problem in registry.verify()] == ["panda-cube@1"]
+    assert [problem.partition(":")[0] for problem in registry.verify()] == ["panda-cube@1", "panda-cube@2"]
     blob.write_bytes(bytes(data[:-5]))
     assert len(registry.verify("panda-cube@1")) == 1
+    blob.unlink()
+    with pytest.raises(DamagedBlobError, match=f"^blob {re.escape(str(blob))} is missing; restore"):
+        registry.load("panda-cube")
     publish()
     assert registry.verify() == []
 
@@ -230,7 +239,7 @@ def test_a_full_disk_changes_nothing(
     publish(value=1.0)
     before = files_in(registry.root)
     full_disk(call)
-    with pytest.raises(StorageError, match="No space left on device"):
+    with pytest.raises(StorageError, match=r"cannot write .*: No space left on device \([0-9]+ bytes free there\)"):
         publish(value=2.0)
     with pytest.raises(StorageError, match="No space left on device"):
         registry.set_alias("panda-cube", "champion", 1)
@@ -326,17 +335,6 @@ def test_export_is_read_back_without_the_registry(registry: Registry, publish: P
     assert_identical(safetensors.numpy.load(data), registry.load("panda-cube")[1])
     with pytest.raises(RegistryError, match="exists; choose another directory"):
         registry.export("panda-cube", target)
-
-
-def test_a_registry_that_is_marked_as_only_read_is_not_written(registry: Registry, publish: Publish) -> None:
-    publish()
-    (registry.root / "READ_ONLY").touch()
-    before = files_in(registry.root)
-    for write in (publish, lambda: registry.set_alias("panda-cube", "best", 1)):
-        with pytest.raises(RegistryError, match=r"cannot write .*: this registry is only read; name another directory"):
-            write()
-    assert files_in(registry.root) == before
-    assert registry.manifest("panda-cube").version == 1
 
 
 def test_a_registry_that_cannot_be_one_is_refused_before_anything_is_learned(tmp_path: Path) -> None:

@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from service.base.errors import TandemError
-from service.cli.main import app
 from service.envs.observations import layouts
 from service.policies.networks import export_parameters, make_bob
 from service.registry.loading import load
 from service.registry.publishing import publish
+from tests.cli.typed import tandem
 from tests.methods import skill_sets
 from tests.runs.runs import assert_one_line, tiny_config
 
@@ -22,7 +21,7 @@ def bob():
 
 def verify(registry):
     """What ``tandem registry verify`` finds, a line each."""
-    result = CliRunner().invoke(app, ["registry", "verify", "--registry", str(registry.root)])
+    result = tandem("registry", "verify", "--registry", registry.root)
     lines = result.stderr.splitlines()
     assert result.exit_code == (1 if lines else 0), result.exception
     return lines

@@ -5,15 +5,14 @@ from itertools import count
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from service.base.errors import DivergedError
-from service.cli.main import app
 from service.methods.workers import RolloutWorker
 from service.policies.numpy_policy import NumpyGaussianPolicy
 from service.runs.resuming import resumed_config
 from service.runs.train import open_run
 from service.store.run_directory import RunDirectory
+from tests.cli.typed import tandem
 from tests.runs.runs import assert_one_line, assert_same_run, newest, play, read_lines, write_yaml
 
 
@@ -75,8 +74,7 @@ def test_parameters_that_are_not_numbers_are_the_same_error(tmp_path):
 
 def test_the_command_ends_with_that_line_and_exit_code_1(tmp_path, monkeypatch):
     diverge_after(monkeypatch, iteration=1)
-    arguments = ["pretrain", "--config", write_yaml(tmp_path / "tiny.yaml"), "--run-dir", tmp_path / "run"]
-    result = CliRunner().invoke(app, [str(part) for part in arguments])
+    result = tandem("pretrain", "--config", write_yaml(tmp_path / "tiny.yaml"), "--run-dir", tmp_path / "run")
     assert result.exit_code == 1
     assert_one_line(result.stderr.splitlines()[-1], "error: ", tmp_path / "run", "iteration 2", "--resume")
 

@@ -6,11 +6,12 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
+from benchmarks.record_run import read_stages
 from service.base.errors import CheckpointError, TandemError
 from service.learner.learner import Learner
 from service.methods import workers
 from service.policies.numpy_policy import numpy_bob
-from service.registry.loading import load, read_stages
+from service.registry.loading import load
 from service.runs.resuming import resumed_config
 from service.runs.run import Run, UnsavedError
 from service.runs.train import open_run

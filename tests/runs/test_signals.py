@@ -6,13 +6,12 @@ from contextlib import suppress
 from types import SimpleNamespace
 
 import pytest
-from typer.testing import CliRunner
 
-from service.cli.main import app
 from service.registry.registry import Registry
 from service.runs import train as training
 from service.runs.run import Run
 from service.runs.signals import PASSED_ON, STOPPING, InterruptError, StopSignals
+from tests.cli.typed import tandem
 from tests.runs.runs import assert_same_run, newest, play, write_yaml
 
 pytestmark = pytest.mark.usefixtures("default_signals")
@@ -112,7 +111,7 @@ def home(tmp_path, monkeypatch):
     def run(*more):
         arguments = ("pretrain", "--run-dir", home.path, "--registry", home.registry, *more)
         arguments += () if "--resume" in more else ("--config", config)
-        return CliRunner().invoke(app, [str(part) for part in arguments], env={"COLUMNS": "80"})
+        return tandem(*arguments)
 
     home.run, home.draw = run, draw
     home.hint = f"continue with: tandem train --resume --run-dir {home.path} --registry {home.registry}\n"

@@ -10,17 +10,16 @@ import subprocess
 import sys
 import threading
 from contextlib import nullcontext
+from functools import partial
 
 import numpy as np
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
 from service.actors.evaluation import EVALUATION_SEED, REPORTED_SEED, SELECTION_SEED, Evaluation
 from service.base.errors import ConfigError, TandemError
 from service.base.lock import is_locked
 from service.base.progress import Display
-from service.cli.main import app
 from service.config import dump_config, load_config
 from service.registry.loading import load
 from service.registry.registry import Registry
@@ -46,6 +45,7 @@ from service.store.checkpoints import CheckpointStore
 from service.store.disk_reader import DiskReader
 from service.store.run_directory import RunDirectory
 from service.store.run_log import read_log
+from tests.cli import typed
 from tests.runs.runs import (
     ROOT,
     TINY_TASK,
@@ -59,11 +59,7 @@ from tests.runs.runs import (
 )
 from tests.store.stores import wait_until
 
-
-def tandem(*arguments, **environment):
-    """Run a command in this process."""
-    variables = {"COLUMNS": "80", "PYTHONPATH": str(ROOT), "MUJOCO_GL": "off", **environment}
-    return CliRunner().invoke(app, [str(argument) for argument in arguments], env=variables)
+tandem = partial(typed.tandem, PYTHONPATH=str(ROOT), MUJOCO_GL="off")
 
 
 # --- seeds and cores -------------------------------------------------------------------------------------------------
@@ -550,8 +546,7 @@ def test_mistakes_get_one_line_and_lose_nothing(begun, tmp_path, arguments, part
     }
     where = [] if "--run-dir" in arguments else ["--run-dir", study.path]
     result = tandem("pretrain", *where, *(names.get(each, each) for each in arguments))
-    assert result.exit_code == 2, result.output
-    assert_one_line(result.stderr, "error: ", *parts)
+    typed.assert_refused(result, *parts)
     assert {path: path.read_bytes() for path in study.path.rglob("*") if path.is_file()} == before
     assert not (tmp_path / "nowhere").exists()
 

@@ -4,12 +4,11 @@ import json
 import sys
 
 import pytest
-from typer.testing import CliRunner
 
 from service.base.errors import TandemError
-from service.cli.main import app
 from service.runs import train as module
 from service.runs.trackers import Trackers
+from tests.cli.typed import assert_refused, tandem
 from tests.methods.trials import SETS
 from tests.runs.runs import TREE, assert_one_line, read_lines, write_yaml
 
@@ -61,10 +60,6 @@ def written(tmp_path, monkeypatch):
     (tmp_path / "trackers_of_a_test.py").write_text(CODE)
     yield
     sys.modules.pop("trackers_of_a_test", None)
-
-
-def tandem(*arguments):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 def read(path):
@@ -124,11 +119,9 @@ def test_one_that_is_none_is_refused_before_the_run(tmp_path, reference, said):
     done = tandem(
         "pretrain", "--config", write_yaml(tmp_path / "tiny.yaml"), "--run-dir", "run", "--tracker", reference
     )
-    assert (done.exit_code, sys.path) == (2, before)
+    assert_refused(done, f"--tracker '{reference}'", said)
+    assert sys.path == before
     assert not (tmp_path / "run").exists()
-    assert f"--tracker '{reference}'" in done.stderr
-    assert said in done.stderr
-    assert done.stderr.count("\n") == 1
 
 
 def test_those_made_before_one_that_cannot_be_are_ended(tmp_path):

@@ -4,11 +4,10 @@ import socket
 from contextlib import contextmanager
 
 import pytest
-from typer.testing import CliRunner
 
-from service.base.ports import DEFAULT_PORT, choose_port, free_port
-from service.cli.main import app
+from service.base.ports import DEFAULT_PORT, choose_port, free_port, url_of
 from service.cluster.ray_connection import StatusOptions, parse_status
+from tests.cli.typed import assert_refused, tandem
 
 
 @contextmanager
@@ -41,19 +40,23 @@ def test_the_next_free_port():
         free_port("127.0.0..1")
 
 
+def test_a_url_leads_to_what_listens_at_all_addresses():
+    assert url_of("lab", 8321) == "http://lab:8321"
+    assert [url_of(host, 1) for host in ("", "0.0.0.0")] == ["http://127.0.0.1:1"] * 2
+    assert [url_of(host, 1) for host in ("::", "::1")] == ["http://[::1]:1"] * 2
+
+
 def test_serve_takes_the_next_one_unless_told_which(tmp_path, monkeypatch, busy, caplog):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs").mkdir()
     monkeypatch.setattr("service.status.server.StatusServer.run", lambda server: server.stop())
     with caplog.at_level("INFO"):
-        result = CliRunner().invoke(app, ["serve"])
+        result = tandem("serve")
     assert result.exit_code == 0, result.output
     chosen = int(result.stdout.splitlines()[0].rpartition(":")[2])
     assert busy < chosen < busy + 50
     assert f"port {busy} is taken, so the status service is at port {chosen}" in caplog.messages
-    told = CliRunner().invoke(app, ["serve", "--port", str(busy)])
-    assert told.exit_code == 2
-    assert f"port {busy} of 127.0.0.1 is taken" in told.stderr
+    assert_refused(tandem("serve", "--port", busy), f"port {busy} of 127.0.0.1 is taken")
 
 
 @pytest.mark.parametrize(("port", "other"), [(7, "127.0.0.1"), (0, "203.0.113.7"), (None, "203.0.113.7")])

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 Observation = dict[str, FloatArray]
 
-_FURTHEST_M = 10.0
+FURTHEST_M = 10.0
 """Bound of every position: an object off the table falls for ever, a space needs an end."""
 
 
@@ -171,8 +171,8 @@ class GoalWorlds:
 
     def _observe(self) -> tuple[Observation, View]:
         """(N, ...) observations, and what success and reward see: places as observed, where both are ours."""
-        positions = np.clip(self._worlds.positions(), -_FURTHEST_M, _FURTHEST_M)
-        achieved = np.clip(self._worlds.object_position, -_FURTHEST_M, _FURTHEST_M).astype(np.float32)  # without noise
+        positions = np.clip(self._worlds.positions(), -FURTHEST_M, FURTHEST_M)
+        achieved = np.clip(self._worlds.object_position, -FURTHEST_M, FURTHEST_M).astype(np.float32)  # without noise
         desired = self._goal.astype(np.float32)
         observation = {"observation": positions, "achieved_goal": achieved, "desired_goal": desired}
         own = self.rules.task.is_own
@@ -184,7 +184,7 @@ def goal_space(config: WorldConfig) -> gymnasium.spaces.Dict:
     goal = 3 * config.num_objects
     sizes = {"observation": layouts(config).positions.size, "achieved_goal": goal, "desired_goal": goal}
     return gymnasium.spaces.Dict(
-        {name: gymnasium.spaces.Box(-_FURTHEST_M, _FURTHEST_M, (size,), np.float32) for name, size in sizes.items()}
+        {name: gymnasium.spaces.Box(-FURTHEST_M, FURTHEST_M, (size,), np.float32) for name, size in sizes.items()}
     )
 
 

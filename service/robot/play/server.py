@@ -52,7 +52,8 @@ class LiveWorld:
             import mjviser  # noqa: F401
             import viser
         self.port = free_port(host, port)
-        self.host = host
+        self.url = ports.url_of(host, self.port)
+        """Address for a browser on this machine."""
         self.game, self._following = Game(players, seed), following
         self._server = _quiet_server(viser, host, self.port)
         try:
@@ -70,12 +71,6 @@ class LiveWorld:
         """Close every connection, and stop."""
         self._server.stop()
         self.game.close()
-
-    @property
-    def url(self) -> str:
-        """Address for a browser on this machine."""
-        host = "127.0.0.1" if self.host in ("", "0.0.0.0", "::") else self.host
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Play until ``stop`` says so; the world stands still without a viewer."""

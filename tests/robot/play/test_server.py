@@ -11,12 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from service.base.errors import TandemError
-from service.cli.main import app
 from service.robot.play import server
 from service.robot.play.server import LiveWorld
+from tests.cli.typed import tandem
 from tests.status.browser import CHROMIUM, Visit, chromium
 
 
@@ -153,7 +152,7 @@ def test_the_command_ends_cleanly(default_signals, monkeypatch):
             run(live, stop)
 
     monkeypatch.setattr(LiveWorld, "run", interrupted)
-    ended = CliRunner().invoke(app, ["play", "--port", "0"])
+    ended = tandem("play", "--port", "0")
     assert (ended.exit_code, ended.stderr) == (0, "")
     first, second, last = ended.stdout.splitlines()
     port = int(first.rsplit(":", 1)[1])
