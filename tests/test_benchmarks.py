@@ -136,7 +136,7 @@ def test_without_panda_gym_one_line_says_how_to_get_it(monkeypatch, capsys):
 def test_panda_gym_plays_where_it_is_installed():
     pytest.importorskip("panda_gym", reason="needs panda-gym: pip install -e '.[bench]'")
     contender = env_throughput.panda_gym(env_throughput.PANDA_GYM_IDS[0])
-    assert contender.episode() == env_throughput.EPISODE_STEPS
+    assert 1 <= contender.episode() <= env_throughput.EPISODE_STEPS  # it ends with success, by a goal that is near
 
 
 # --- time to skill ----------------------------------------------------------------------------------------------------
