@@ -176,12 +176,12 @@ def headline_table(results: Sequence[Result], coming: Sequence[Result] = ()) -> 
 def _coming(results: Sequence[Result]) -> str:
     """What the next table has so far of tasks that were composed, beside what learned from nothing."""
     rates = {place: rate_of(seeds) for place, seeds in by_method_and_task(results).items()}
-    found = [task for task in PAPERS if (_OWN, task) in rates]
-    cells = [
-        f"{find_task(task).title} {_best([rates[_OWN, task]])}, from nothing "
-        + (_best([rates[name, task] for name in learning(None) if (name, task) in rates]) or "not run")
-        for task in found
-    ]
+    cells = []
+    for task in PAPERS:
+        if (_OWN, task) in rates:
+            nothing = _best([rates[name, task] for name in learning(None) if (name, task) in rates])
+            beside = f", from nothing {nothing}" if nothing else ""
+            cells.append(f"{find_task(task).title} {_best([rates[_OWN, task]])}{beside}")
     return f" With today's primitives so far: {'; '.join(cells)}." if cells else ""
 
 
