@@ -111,7 +111,6 @@ class Report:
                 recipe.check_words(self._docs / page, words, found["time_to_skill"])
         seeds, why = read_all(self._results / "seeds"), read_all(self._results / "why_alice")
         coming = list(read_all(self._results / RESULTS.name / "downstream").values())
-        headline = {"headline": [comparison.headline_table(trials, coming)]}
         judged = (
             pretraining.seeds_words(seeds[SEEDS]),
             time_to_skill.words(found["time_to_skill"]),
@@ -122,8 +121,11 @@ class Report:
             "results/pretraining.md": self.pretraining_blocks(runs, found, seeds, why),
             "results/skills.md": self.skills_blocks(recorded_skills),
             "results/comparison.md": self.comparison_blocks(trials),
-            "downstream.md": headline,
-            "../README.md": headline | {"seeds": ["\n".join(filter(None, judged))]},
+            "downstream.md": {"headline": [comparison.headline_table(trials, coming)]},
+            "../README.md": {
+                "headline": [comparison.headline_table(trials)],
+                "seeds": ["\n".join(filter(None, judged))],
+            },
             "own_task.md": {"learned": [measured.own_task_table(read_all(self._results / "own_task"))]},
             "scaling.md": {
                 "box": [scaling.box_block(found["scaling_box"])],
