@@ -41,7 +41,7 @@ from service.runs.train import publish_learned
 from service.store.disk_reader import DiskReader, run_id_of
 from service.store.models import MAX_BYTES, STUDY_FILE
 from service.store.run_directory import RunDirectory
-from service.store.run_history import BEFORE, written_for
+from service.store.run_history import BEFORE, of_another_version
 
 SHOW_S = 1.0
 """Time between two looks into the run directories."""
@@ -92,7 +92,7 @@ class Study:
         with suppress(ParseError, ValidationError):
             tree = parse_json(data, self.file)
             if isinstance(tree, dict) and "seeds" in tree:
-                raise ConfigError(written_for(self.file, BEFORE))
+                raise ConfigError(of_another_version(self.file, BEFORE))
             self._study = StudyFile.model_validate(tree)
             return self._study
         raise StorageError(

@@ -54,9 +54,9 @@ from service.store.run_history import (
     Event,
     RunHistory,
     is_of_this_version,
+    of_another_version,
     read_history,
     read_note,
-    written_for,
 )
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ class RunDirectory:
         history = read_history(self.path)
         version = history.tandem if history is not None else BEFORE
         if not is_of_this_version(version):
-            raise ConfigError(written_for(self.path, version))
+            raise ConfigError(of_another_version(self.path, version))
         return load_config(self.config_file, overrides)
 
     def start(self, config: Config, resumption: Resumption | None = None) -> None:

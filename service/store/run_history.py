@@ -52,9 +52,9 @@ class RunHistory(FrozenModel):
         write_atomic(directory / FILE, self.model_dump_json(indent=1).encode() + b"\n")
 
 
-def written_for(path: Path, version: str) -> str:
-    """Say of what another version has written which version reads it."""
-    return f"{path} is of another version of tandem, which this one does not read: use tandem {version}"
+def of_another_version(path: Path, reader: str) -> str:
+    """Say that another version has written this, and which version reads it."""
+    return f"{path} is of another version of tandem, which this one does not read: use tandem {reader}"
 
 
 def is_of_this_version(version: str) -> bool:
