@@ -67,12 +67,11 @@ def experiments(out: Path = RESULTS) -> Iterator[Experiment]:
         yield from (_trial(out, task, method, seed) for method in ("ours-her", "ours") for task in tasks)
         yield _trial(out, "push", "ours-residual-her", seed)
         yield from (_trial(out, task, method, seed) for method in ("asp-only", "idle") for task in tasks)
-    for seed in PRIMITIVES:
-        yield from (_trial(out, task, method, seed) for method in nothing for task in tasks)
-        yield from _skills(out, seed)
+    yield from (_trial(out, task, method, seed) for seed in PRIMITIVES for method in nothing for task in tasks)
     for task in ("inair", "sphere", "push"):
         yield from (_longer(out, task, f"scratch-{net}-her") for net in ("monolithic", "mcp"))
         yield _longer(out, task, "scratch-monolithic-her", MANY_UPDATES)
+    yield from (each for seed in PRIMITIVES for each in _skills(out, seed))
     for seed, reference in PAPER_PRIMITIVES.items():
         for method in ("ours", "asp-only"):
             for task in tasks:
