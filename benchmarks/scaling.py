@@ -161,7 +161,9 @@ def model_block(result: Mapping[str, Any], skill: Mapping[str, Any]) -> str:
     head = ("cores", "an update every", "minutes to the skill", "learner busy", "or seeds an hour, two cores each")
     return (
         f"One learner of one thread keeps up with {costs.num_fed:.1f} actors of {costs.num_worlds} worlds each. "
-        f"A run shares {costs.num_worlds} worlds out among its actors. It gains {_until(costs)}.\n\n{table(head, rows)}"
+        f"A run shares {costs.num_worlds} worlds out among its actors. A part of each round takes as long with few "
+        "worlds as with many, so two actors are less than twice as fast as one. "
+        f"A run gains {_until(costs)}.\n\n{table(head, rows)}"
     )
 
 

@@ -1,6 +1,6 @@
 """Tandem: asymmetric self-play that pre-trains reusable robot-manipulation skills.
 
-Importing this package is cheap: torch, MuJoCo and matplotlib come in with the rooms that need them.
+Importing this package is cheap: torch, MuJoCo and matplotlib come in with the parts that need them.
 """
 
 from __future__ import annotations

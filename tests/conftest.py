@@ -1,4 +1,4 @@
-"""Fixtures that several rooms use, and one thread per test process.
+"""Fixtures that several packages of tests use, and one thread per test process.
 
 xdist keeps every core busy, and results do not depend on the thread count.
 The variables have to be set before NumPy or torch is imported, so that happens here, at import.

@@ -164,9 +164,9 @@ def test_start_heres_task_is_learned_measured_and_loaded(tmp_path, monkeypatch):
     *_, load = blocks((ROOT / "docs" / "downstream.md").read_text(), "python")
     assert '"wall-orchestrator@best"' in load
     code = load.replace("wall-orchestrator@best", typed[1][-1])
-    names = {"observation": np.zeros((3, 14), np.float32)}
+    names = {}
     exec(compile(code, "downstream.md", "exec"), names)
-    assert names["action"].shape == (3, 4)
+    assert names["action"].shape == (4, 4)  # of as many worlds
 
 
 def test_the_task_that_is_shown_whole_is_the_example():

@@ -26,6 +26,8 @@ DIPS_FROM = 4e6
 """Env steps from which on two evaluations in a row below what is asked for are a dip."""
 DIGITS = 12
 """Of a digest on a page, as in the table of tasks."""
+NUM_LAST = 5
+"""Evaluations at the end of a run, of which Alice's share of lifted goals is the mean."""
 
 
 def champion_words(seeds: Mapping[str, Any]) -> str:
@@ -79,12 +81,13 @@ def _judged(evaluations: Records) -> list[str]:
 def seeds_block(study: Mapping[str, Any]) -> str:
     """What ``benchmarks.seeds`` recorded: a row for each seed, and how many there are of what is asked for."""
     at = sorted({row["asked"] for run in study["runs"] for row in run["measured"]})
-    head = ("seed", *(f"{millions(asked)}: mixed, table, air, *Larger*" for asked in at), "dips")
+    head = ("seed", *(f"{millions(asked)}: mixed, table, air, *Larger*" for asked in at), "dips", "Alice lifts")
     rows = []
     for run in study["runs"]:
         found = {row["asked"]: row for row in run["measured"]}
         cells = [", ".join(f"{100 * found[a][kind]['last']:.1f}" for kind in KINDS) if a in found else "" for a in at]
-        rows.append((str(run["seed"]), *cells, str(num_dips(run["curve"]))))
+        lifts = [point["lifted"] for point in run["curve"][-NUM_LAST:]]
+        rows.append((str(run["seed"]), *cells, str(num_dips(run["curve"])), percent(fmean(lifts))))
     words = f"At least {percent(ASKED_RATES['mixed'])} of mixed goals: {_how_many(study)} env steps."
     return f"{table(head, rows)}\n\n{words}"
 
@@ -102,7 +105,7 @@ def seeds_words(study: Mapping[str, Any]) -> str:
     """The same in a sentence for the README."""
     asked = percent(ASKED_RATES["mixed"])
     return (
-        f"Of runs with seeds on which nothing was tuned, so many solve {asked} of random goals or more:\n"
+        f"So many runs solve {asked} of random goals or more (no setting was tuned on their seeds):\n"
         f"{_how_many(study)} env steps ([each seed](docs/results/pretraining.md#every-seed))."
     )
 
@@ -146,9 +149,10 @@ def why_alice_words(studies: Mapping[str, Mapping[str, Any]]) -> str:
         for name, study in studies.items()
     }
     return (
-        f"[Why Alice](docs/results/pretraining.md#why-alice)? Of random goals Bob solves {mean['recipe']} with her, "
-        f"{mean['uniform-new-alice']} if she never learns,\n{mean['uniform-alone']} without her, {mean['no-cloning']} "
-        f"if he clones none of her turns, {mean['no-difficulty']} if she is not paid for his failures."
+        f"[Why Alice](docs/results/pretraining.md#why-alice)? Of random goals Bob solves {mean['recipe']}; "
+        f"{mean['no-cloning']} if he clones none of her turns, {mean['no-difficulty']} if she is unpaid for his misses."
+        f"\nIf he also practises goals of the whole workspace: {mean['uniform']} beside her, "
+        f"{mean['uniform-new-alice']} if she never learns, {mean['uniform-alone']} without her."
     )
 
 

@@ -1,1 +1,1 @@
-"""What every room uses: errors, types, atomic files, locks, JSON lines, tensors, progress, optional packages."""
+"""What every package uses: errors, types, atomic files, locks, JSON lines, tensors, progress, optional packages."""

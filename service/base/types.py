@@ -1,4 +1,4 @@
-"""Array types that every room shares."""
+"""Array types that every package shares."""
 
 from __future__ import annotations
 

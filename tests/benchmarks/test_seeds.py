@@ -68,19 +68,23 @@ def test_the_table_of_seeds_by_hand():
     def row(asked, mixed):
         return {"asked": asked} | {kind: {"last": mixed} for kind in seeds.KINDS}
 
+    lifted = (0.9, 0.1, 0.3, 0.0, 0.2, 0.4)  # of the last five the mean is 0.2
+    curve = [{"env_steps": 1e6, "mixed": 0.9, "lifted": share} for share in lifted]
     runs = [
-        {"seed": 1, "measured": [row(2e6, 0.95), row(5e6, 0.978)], "curve": []},
-        {"seed": 2, "measured": [row(2e6, 0.949)], "curve": []},
+        {"seed": 1, "measured": [row(2e6, 0.95), row(5e6, 0.978)], "curve": curve},
+        {"seed": 2, "measured": [row(2e6, 0.949)], "curve": curve[:1]},
     ]
     assert seeds_block({"runs": runs}).splitlines() == [
-        "| seed | 2 M: mixed, table, air, *Larger* | 5 M: mixed, table, air, *Larger* | dips |",
-        "| --- | --- | --- | --- |",
-        "| 1 | 95.0, 95.0, 95.0, 95.0 | 97.8, 97.8, 97.8, 97.8 | 0 |",
-        "| 2 | 94.9, 94.9, 94.9, 94.9 |  | 0 |",
+        "| seed | 2 M: mixed, table, air, *Larger* | 5 M: mixed, table, air, *Larger* | dips | Alice lifts |",
+        "| --- | --- | --- | --- | --- |",
+        "| 1 | 95.0, 95.0, 95.0, 95.0 | 97.8, 97.8, 97.8, 97.8 | 0 | 20 % |",
+        "| 2 | 94.9, 94.9, 94.9, 94.9 |  | 0 | 90 % |",
         "",
         "At least 95 % of mixed goals: 1 of 2 at 2 M, 1 of 1 at 5 M env steps.",
     ]
-    assert "95 % of random goals or more:\n1 of 2 at 2 M, 1 of 1 at 5 M env steps (" in seeds_words({"runs": runs})
+    words = seeds_words({"runs": runs})
+    assert words.startswith("So many runs solve 95 % of random goals or more (")
+    assert "):\n1 of 2 at 2 M, 1 of 1 at 5 M env steps (" in words
     for run, day in zip(runs, (27, 28), strict=True):
         run |= {"git_commit": "fb14796" + 33 * "0", "machine": {"time": f"2026-11-{day}T08:00:00"}}
     first, _, head, *_ = other_seeds("panda-cube-paper", {"runs": runs}).splitlines()
@@ -101,7 +105,8 @@ def test_what_alice_is_for_by_hand():
     assert len(lines) == 4
     assert why_alice_words(some) == ""
     words = why_alice_words(dict.fromkeys(ARMS, study(0.1, 0.2)) | some)
-    assert "solves 96 % with her, 15 % if she never learns,\n15 % without her, 50 % if he clones none" in words
+    assert "solves 96 %; 50 % if he clones none of her turns, 15 % if she is unpaid" in words
+    assert "15 % beside her, 15 % if she never learns, 15 % without her" in words
 
 
 @pytest.mark.parametrize("name", ARMS)
