@@ -160,15 +160,19 @@ def os_errors(
         if action == "read":
             raise error_type(f"cannot read {path}: {reason}; check the path, its permissions and the disk") from error
         raise error_type(
-            f"cannot write {path}: {reason} ({_free_bytes(path)} bytes free there); "
+            f"cannot write {path}: {reason}{_free_there(path)}; "
             "free some space or check the permissions and try again; what was saved before is intact"
         ) from error
 
 
 def remove_temporaries(directory: Path) -> None:
-    """Delete what killed writers left in ``directory``; only where no other writer can be at work."""
+    """Delete the files that killed writers left in ``directory``; only where no other writer can be at work.
+
+    A directory stays: it is of a ``new_directory`` that may still be filled.
+    """
     for path in directory.glob(f"{TEMPORARY_PREFIX}*"):
-        path.unlink(missing_ok=True)
+        if not path.is_dir():
+            path.unlink(missing_ok=True)
 
 
 class Appender:
@@ -209,9 +213,8 @@ class Appender:
             StorageError: as for `append_bytes`.
         """
         self._flush()
-        if self.path.is_file():
-            with os_errors("write", self.path), open_regular(self.path) as file:
-                os.fsync(file.fileno())
+        with os_errors("write", self.path), contextlib.suppress(FileNotFoundError), open_regular(self.path) as file:
+            os.fsync(file.fileno())
 
     def _flush(self) -> None:
         if not self._waiting:
@@ -265,9 +268,12 @@ def _flush_directory(directory: Path) -> None:
         os.close(descriptor)
 
 
-def _free_bytes(path: Path) -> int:
-    existing = next(parent for parent in path.absolute().parents if parent.exists())
-    return shutil.disk_usage(existing).free
+def _free_there(path: Path) -> str:
+    """How much room there is, in brackets; nothing where the disk does not say."""
+    existing = next(parent for parent in path.absolute().parents if os.path.exists(parent))
+    with contextlib.suppress(OSError):
+        return f" ({shutil.disk_usage(existing).free} bytes free there)"
+    return ""
 
 
 def _write_whole(file: FileIO, piece: bytes) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections import Counter
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -101,6 +102,8 @@ def parse_yaml(text: str | bytes, where: object) -> Any:
     return tree
 
 
+EXPONENT = re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+")
+"""Numbers such as 1e-3 and 3e6, which PyYAML reads as text, as YAML 1.1 says."""
 _TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
 
 
@@ -115,6 +118,9 @@ class _Loader(yaml.SafeLoader):
             if count > 1:
                 raise yaml.YAMLError(f"the key {key!r} is there {count} times")
         return node
+
+
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", EXPONENT, list("-+0123456789"))
 
 
 def _check(tree: Any, where: object, greatest: int, *, allow_nan: bool, max_values: float = math.inf) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -39,8 +40,9 @@ def named(what: str | None, method: str | None, primitives: str | None) -> tuple
     if what is not None and is_task(what):
         if method in OF_TASKS and method not in METHODS:
             raise TandemError(f"{method} learns nothing: measure it by tandem evaluate --task {what} --method {method}")
-        chosen = [f"task={what}", f"method={method or 'ours'}"]
-        return None, chosen + [f"primitives={primitives}"] * (primitives is not None)
+        chosen = {"task": what, "method": method or "ours"} | ({} if primitives is None else {"primitives": primitives})
+        # as JSON, which is YAML: a name may look like a number or a date
+        return None, [f"{key}={json.dumps(word, ensure_ascii=False)}" for key, word in chosen.items()]
     if primitives is not None:
         raise TandemError("--primitives is for learning a task: name one, such as push; a run begins from --from")
     if what is None:

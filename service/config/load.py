@@ -10,6 +10,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from service.base.errors import ConfigError, did_you_mean
+from service.base.parsing import EXPONENT
 from service.base.user_code import recorded
 from service.config.find import METHODS, find_class
 from service.config.frozen import NO_KEYS, first_error
@@ -97,6 +98,7 @@ class _Dumper(yaml.SafeDumper):
     """Writes texts of several lines as they are."""
 
 
+_Dumper.add_implicit_resolver("tag:yaml.org,2002:float", EXPONENT, list("-+0123456789"))  # a text like that: in quotes
 _Dumper.add_representer(
     str, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, "|" if "\n" in text else None)
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +48,6 @@ def apply_override(tree: dict[str, Any], override: str) -> None:
         value = parse_yaml(text, "its value")
     except ParseError as error:
         raise ConfigError(f"override {one_line(override, 200)!r}: the value is {error.reason}") from None
-    if isinstance(value, str):
-        with suppress(ValueError):
-            value = float(value)  # YAML 1.1 reads 1e-3 as text
     group, name = group_of(tree, key.strip(), where=f"override {override!r}")
     group[name] = value
 

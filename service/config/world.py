@@ -143,7 +143,7 @@ class WorldConfig(FrozenModel):
     object_size_m: float = Field(
         0.05, ge=0.02, le=0.07, description="cube edge or sphere diameter; paper: 5 cm. A description has its own"
     )
-    object_mass_kg: float = Field(0.1, gt=0.0, le=2.0)
+    object_mass_kg: float = Field(0.1, gt=0.0, le=5.0)
     friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of the object, also on the table")
     pad_friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of the fingertips on the object")
     gripper: Literal["free", "blocked"] = Field("free", description="blocked: held closed, whatever the action says")

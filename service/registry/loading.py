@@ -90,7 +90,10 @@ class Trained:
             return self.manifest.reference
         if self.kind == "orchestrator" or self.path is None:
             return self.config.directory_name
-        return f"{self.config.name} of the run {self.path.resolve().name}"
+        place = self.path.resolve()
+        if place.is_file():  # a checkpoint or a snapshot
+            return f"{self.config.name} of the run {place.parent.parent.name}, {place.stem}"
+        return f"{self.config.name} of the run {place.name}"
 
     @property
     def title(self) -> str:

@@ -82,6 +82,8 @@ def publish_run(
         known = directory.history
         history = known.model_dump(mode="json") if known is not None and known.events else None
         version = publish(registry, config, parameters, metrics, parent=parent, history=history)
+    elif (last := directory.read_published()) is None or last.version != str(version):
+        registry.complete(version)  # whoever published it may have been cut off
     directory.write_published(Published(str(version), registry.manifest(str(version)).blob_sha256))
     return version
 

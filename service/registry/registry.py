@@ -115,8 +115,17 @@ class Registry:
             "git_commit": git_commit(),
         }
         version = self._publish_version(name, parameters, fields)
-        self._move_alias(name, LATEST, version.number, back=False)
+        self.complete(version)
         return version
+
+    def complete(self, version: Version) -> None:
+        """End the publishing of a version that is there: move ``latest`` forward to it.
+
+        Raises:
+            RegistryError: the alias is damaged.
+            StorageError: the disk cannot be written.
+        """
+        self._move_alias(version.name, LATEST, version.number, back=False)
 
     def resolve(self, reference: str) -> Version:
         """The version that ``NAME``, ``NAME@VERSION`` or ``NAME@ALIAS`` means now; ``NAME`` is ``NAME@latest``.

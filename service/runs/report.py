@@ -43,7 +43,8 @@ class Report:
         runtime: which runner runs it.
         writer: to whom it is told.
         published: what the run published before.
-        previous: the last status of an earlier process, whose totals go on.
+        previous: the last status of an earlier process, whose totals go on. How far that came, and what a task has
+            come to, stays until the run goes on: it may be refused.
         epoch: number of this process among those that ever ran the run.
     """
 
@@ -72,6 +73,7 @@ class Report:
                 primitives=config.primitives if digest is not None else None,
                 primitives_digest=digest,
             )
+        self._trial = trial
         self._status = RunStatus(
             run_id=run_id,
             name=config.name,
@@ -83,8 +85,10 @@ class Report:
             total_env_steps=config.run.total_env_steps,
             trial=trial,
             published=published,
-            totals=previous.totals if previous is not None else RunTotals(),
         )
+        if previous is not None:
+            kept = {key: getattr(previous, key) for key in ("totals", "iteration", "num_env_steps", "trial")}
+            self._status = self._status.model_copy(update=kept)
 
     def __enter__(self) -> Self:
         self._tell()
@@ -125,7 +129,7 @@ class Report:
 
     def begin(self, run: Run) -> None:
         """Say that the run begins, or goes on where it was."""
-        self._status = self._status.model_copy(update={"state": "running"})
+        self._status = self._status.model_copy(update={"state": "running", "trial": self._trial})
         self._counted = self._counters(run)  # where it goes on is no work of this process
         if not self._totals:  # of earlier ones nothing is known but how far they came
             self._totals = {name: self._counted[name] for name in ("iterations", "env_steps")}

@@ -247,7 +247,8 @@ class Study:
         best = best_of(runs)
         self._write(self._study.model_copy(update={"best": best}))  # known, whatever happens while it is published
         if best is not None and registry is not None and configs[best].publishable:
-            version = publish_learned(self.path / best, registry, metrics=published_metrics(runs[best]))
+            metrics = published_metrics(runs[best], configs[best].world.usual_goals)
+            version = publish_learned(self.path / best, registry, metrics=metrics)
             self._write(self._study.model_copy(update={"published": str(version)}))
 
     def _jobs(

@@ -16,13 +16,11 @@ import numpy as np
 
 from service.actors.evaluation import SELECTION_SEED, evaluate_run
 from service.base.types import StateArray
-from service.envs.sampling import GoalKind
 from service.policies.numpy_policy import numpy_bob
 from service.registry.loading import load
 from service.runs.grid import SEED, Settings
 from service.runs.study_run import StudyRun
 
-SELECTION_GOALS: GoalKind = "mixed"
 SELECTION_EPISODES = 1000
 """A success of 95 % is then known to 1.4 points either way."""
 SELECTED, DISTANCE = "selection_success_last", "selection_mean_distance_m"
@@ -124,8 +122,8 @@ def select(directory: Path) -> dict[str, float]:
         TandemError: the run has no usable checkpoint.
     """
     trained = load(str(directory))
-    bob = numpy_bob(trained.parameters)
-    found = evaluate_run(bob, trained.config, SELECTION_GOALS, SELECTION_EPISODES, seed=SELECTION_SEED)
+    bob, goals = numpy_bob(trained.parameters), trained.config.world.usual_goals
+    found = evaluate_run(bob, trained.config, goals, SELECTION_EPISODES, seed=SELECTION_SEED)
     return {SELECTED: found.success_last, DISTANCE: found.mean_distance_m}
 
 
@@ -135,7 +133,12 @@ def best_of(runs: Mapping[str, StudyRun]) -> str | None:
     return max(scores, key=lambda name: (scores[name][SELECTED], -scores[name][DISTANCE]), default=None)
 
 
-def published_metrics(run: StudyRun) -> dict[str, float]:
-    """What a version says of the best run: what was measured at its end, and its success on the goals that chose it."""
+def published_metrics(run: StudyRun, goals: str) -> dict[str, float]:
+    """What a version says of the best run: what was measured at its end, and its success on the goals that chose it.
+
+    Args:
+        run: the best one.
+        goals: kind of those that chose it.
+    """
     metrics = {f"evaluation/{name}": value for name, value in run.result.items() if not name.startswith("selection_")}
-    return metrics | {f"selection/{SELECTION_GOALS}_success_last": run.result[SELECTED], "env_steps": run.env_steps}
+    return metrics | {f"selection/{goals}_success_last": run.result[SELECTED], "env_steps": run.env_steps}

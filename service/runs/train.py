@@ -17,7 +17,8 @@ from typing import Literal, cast
 
 from pydantic import JsonValue
 
-from service.base.errors import StoreError, TandemError
+from service.base.errors import TandemError
+from service.base.jsonl import plain
 from service.base.progress import answer, doing
 from service.base.types import Metrics
 from service.base.user_code import changed_since
@@ -41,7 +42,7 @@ from service.store.disk_reader import run_id_of
 from service.store.models import ACTIVE, RunState, read_status
 from service.store.run_directory import Published, RunDirectory
 from service.store.run_log import logging_to
-from service.store.run_writer import reporting_to
+from service.store.run_writer import RunWriter, reporting_to
 
 MAX_STATES_LOST = 5
 """Times in a row that a run goes back to a checkpoint without getting beyond it."""
@@ -248,7 +249,9 @@ def _run(
 def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, report: Report) -> Finished:
     _logger.info("learning is over; now evaluating, publishing, drawing and recording a video")
     config, directory, parameters = run.config, run.directory, run.method.parameters()
-    metrics, version = run.method.measure(), None
+    # a method of a user's may give numbers of NumPy's, and such as are none
+    metrics = {name: value for name, value in plain(run.method.measure()).items() if value is not None}
+    version = None
     run.close()
     directory.check_owner()
     found: dict[str, JsonValue] = {name.removeprefix("evaluation/"): value for name, value in metrics.items()}
@@ -304,7 +307,10 @@ def publish_learned(
         status, run_id = read_status(path), run_id_of(path)
         if status is not None and status.state not in ACTIVE:
             told = status.model_copy(update={"run_id": run_id, "published": str(version), "epoch": directory.epoch})
-            with suppress(StoreError), closing(reporting_to(directory, run_id, address_from_environment())) as writer:
+            with closing(RunWriter(directory)) as writer:
+                writer.status(told)
+            # the version is there, so no trouble with Redis is one of this call
+            with suppress(TandemError), closing(reporting_to(directory, run_id, address_from_environment())) as writer:
                 writer.status(told)
     return version
 

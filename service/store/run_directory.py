@@ -319,14 +319,16 @@ class RunDirectory:
 
     def dump_diverged(self, name: str, diverged: Sequence[tuple[StateArray, FloatArray]]) -> None:
         """Save the (state, action) pairs of a round whose physics diverged, under the round's name, for 100 rounds."""
-        if not diverged or (self.diverged.is_dir() and len(list(self.diverged.iterdir())) >= MAX_DIVERGED_FILES):
+        if not diverged:
             return
         states, actions = zip(*diverged, strict=True)
         path, data = self.diverged / f"round-{name}.npz", io.BytesIO()
         np.savez(data, states=np.stack(states), actions=np.stack(actions))
         _logger.warning("physics diverged in %d worlds, which go on from sound states; see %s", len(states), path)
-        with self.keep_running(self.diverged):
-            write_atomic(path, data.getvalue())
+        with self.keep_running(self.diverged), os_errors("write", self.diverged):
+            self.diverged.mkdir(exist_ok=True)
+            if len(list(self.diverged.iterdir())) < MAX_DIVERGED_FILES:
+                write_atomic(path, data.getvalue())
 
     def sync(self) -> dict[str, Extent]:
         """Wait until the disk has every record, and say what there is: a checkpoint must not know more than they do."""

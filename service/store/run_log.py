@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from io import BufferedWriter, TextIOWrapper
 from logging.handlers import RotatingFileHandler
@@ -60,7 +60,8 @@ def logging_to(directory: Path) -> Iterator[Callable[[str], None]]:
         raise
     finally:
         _LOGGER.removeHandler(handler)
-        handler.close()
+        with suppress(OSError):  # it writes once more what did not fit, and must not hide why the run ended
+            handler.close()
 
 
 class _Handler(RotatingFileHandler):

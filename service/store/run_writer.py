@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -102,7 +103,8 @@ class RunWriter:
 
     def stop_requested(self) -> bool:
         """Whether the run was asked to stop anywhere since it was started."""
-        return self._stop_file.exists() or (self._redis is not None and self._redis.stop_requested())
+        # no exists() of Path: it raises where the directory may not be read
+        return os.path.exists(self._stop_file) or (self._redis is not None and self._redis.stop_requested())
 
     def troubles(self) -> list[Trouble]:
         """Problems at the moment, such as files that cannot be written; empty when all is well."""

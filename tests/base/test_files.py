@@ -89,6 +89,14 @@ def test_nothing_is_left_of_a_new_directory_that_was_not_finished(tmp_path):
     assert sorted(each.name for each in tmp_path.iterdir()) == ["other"]
 
 
+def test_what_killed_writers_left_is_removed_but_no_directory(tmp_path):
+    """It may be of an export that goes on."""
+    (tmp_path / ".tmp-1-aa").write_text("torn")
+    (tmp_path / ".tmp-2-bb").mkdir()
+    files.remove_temporaries(tmp_path)
+    assert [each.name for each in tmp_path.iterdir()] == [".tmp-2-bb"]
+
+
 # --- regular files ---------------------------------------------------------------------------------------------------
 
 

@@ -13,6 +13,7 @@ import typer
 
 from service.base.errors import TandemError, did_you_mean
 from service.base.version import __version__
+from service.cli.configs import named
 from service.cli.main import app
 from service.config import load_config
 from service.config.recipes import CONFIGS, recipes, robots
@@ -51,6 +52,12 @@ def test_a_file_stands_alone_and_a_name_comes_first(begun):
     tandem("pretrain", "--config", "panda-cube")
     tandem("pretrain", "--config", "./panda-cube")
     assert begun == [load_config(RECIPE), load_config(overrides=["seed=5"])]
+
+
+def test_a_word_that_looks_like_a_number_or_a_date_is_a_word():
+    for word in ("2024-05-01", "1e5", "on", "7"):
+        _, overrides = named("push", "ours", word)
+        assert load_config(overrides=overrides).primitives == word
 
 
 def test_configs_are_listed_and_shown():

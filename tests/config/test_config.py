@@ -52,6 +52,11 @@ def test_yaml_round_trip(tmp_path):
     path = tmp_path / "run.yaml"
     path.write_text(dump_config(config))
     assert load_config(path) == config
+    config = config.model_copy(update={"name": "1e5"})  # a text that looks like a number
+    path.write_text(dump_config(config))
+    assert load_config(path) == config
+    path.write_text("run: {total_env_steps: 3e6}\nlearner: {bob: {learning_rate: 3e-4}}")
+    assert load_config(path).run.total_env_steps == 3_000_000
 
 
 @pytest.mark.parametrize("text", ["", "# nothing here\n", "null", "---\n"])
@@ -80,6 +85,7 @@ def test_an_empty_file_is_refused(tmp_path, text):
         ("world.workspace.center_y_m=-0.1", "world.workspace.center_y_m", -0.1),
         ("policy.alice.hidden_sizes=[64,32]", "policy.alice.hidden_sizes", (64, 32)),
         (" seed =3", "seed", 3),
+        ("name='1e5'", "name", "1e5"),
     ],
 )
 def test_override(override, path, value):
@@ -114,7 +120,7 @@ def test_overrides_beat_the_file_and_the_last_one_wins(tmp_path):
         ("game.num_worlds=0", ["game.num_worlds = 0"]),
         ("world.object=teapot", ["world.object = ", "teapot"]),
         ("seed=0.5", ["seed = 0.5"]),
-        ("learner.bob.learning_rate=nan", ["learner.bob.learning_rate = nan"]),
+        ("learner.bob.learning_rate=nan", ["learner.bob.learning_rate = 'nan'"]),
         ("learner.device=tpu", ["learner.device = 'tpu'"]),
         ("name=../escape", ["name = '../escape'"]),
         ("policy.alice.hidden_sizes=[64,0]", ["policy.alice.hidden_sizes.1 = 0"]),

@@ -45,6 +45,7 @@ def test_a_list_of_one_is_the_world_of_one_object(only, same):
 
 
 def test_what_is_named_has_the_worlds_size_mass_and_friction_and_a_color_of_its_own():
+    assert WorldConfig(objects=({**CYLINDER, "mass_kg": 3.0},)).object_mass_kg == 3.0  # as much as beside others
     world = WorldConfig(objects=("cube", CYLINDER, "sphere"), object_size_m=0.04, object_mass_kg=0.3, friction=0.5)
     cube, cylinder, sphere = world.bodies
     assert (cube.extent_m, cube.mass_kg, cube.friction) == ((0.04,) * 3, 0.3, 0.5)

@@ -133,7 +133,7 @@ def test_a_checkpoint_and_a_snapshot_of_a_run(run, tmp_path, monkeypatch):
     newest = checkpoints.CheckpointStore(path / "checkpoints", keep=1).newest()
     monkeypatch.chdir(newest.parent)
     found, rows = load(newest.name), observations(BOB.size)
-    assert found.reference == str(newest)
+    assert (found.reference, found.name) == (str(newest), f"tiny of the run run, {newest.stem}")
     expected = NumpyMCPPolicy(learner.weights().bob).act_deterministic(rows)
     assert np.array_equal(found.act_deterministic(rows), expected)
     first = load(str(min((path / "snapshots").iterdir())))

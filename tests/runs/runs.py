@@ -4,6 +4,7 @@ The object is large and right under the gripper and the success distance is smal
 """
 
 import json
+import os
 import re
 import resource
 import subprocess
@@ -143,6 +144,20 @@ def no_room_above(num_bytes):
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@contextmanager
+def no_permission(path):
+    """Nothing under ``path`` can be read or written, as where a mount is gone; root becomes another user for it."""
+    before, user = path.stat().st_mode, os.geteuid()
+    path.chmod(0)
+    if user == 0:
+        os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(user)
+        path.chmod(before)
 
 
 class FullForAWhile:

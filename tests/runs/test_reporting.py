@@ -1,23 +1,26 @@
 """What a run in one process tells while it goes on, and that only one process runs it."""
 
 import json
+import math
 import signal
 import threading
 import time
 from multiprocessing import get_context
 
 import httpx
+import numpy as np
 import pytest
 
 from service.base import lock
 from service.base.errors import DivergedError, RunTakenError, StoreUnavailableError, TandemError
 from service.base.lock import claim_epoch
+from service.methods.self_play import SelfPlay
 from service.registry.registry import Registry
 from service.runs import report
 from service.runs import train as module
 from service.runs.resuming import resumed_config
 from service.runs.signals import InterruptError
-from service.runs.train import UnfinishedError, train
+from service.runs.train import UnfinishedError, publish_learned, train
 from service.status.run_reader import open_reader
 from service.status.server import StatusServer
 from service.store import redis_writer, run_writer
@@ -133,6 +136,36 @@ def test_how_a_run_failed(tmp_path, monkeypatch):
     with pytest.raises(UnfinishedError):
         run(tmp_path, resume=True)
     assert_one_line(status(tmp_path).last_error, "saved, but not published: a problem", "--resume")
+
+
+def test_a_resume_that_is_refused_leaves_what_the_run_has_come_to(tmp_path, monkeypatch):
+    done = run(tmp_path)
+
+    def refuse(*_, **__):
+        raise TandemError("its primitives are gone")
+
+    monkeypatch.setattr(module, "open_run", refuse)
+    with pytest.raises(TandemError):
+        run(tmp_path, resume=True)
+    last = status(tmp_path)
+    assert (last.state, last.last_error) == ("failed", "TandemError: its primitives are gone")
+    assert (last.iteration, last.num_env_steps) == (done.iteration, done.num_env_steps)
+
+
+def test_numbers_of_numpy_and_such_as_are_none_end_no_run(tmp_path, monkeypatch):
+    measured = {"evaluation/mixed_success_last": np.float32(0.5), "evaluation/odd": math.nan}
+    monkeypatch.setattr(SelfPlay, "measure", lambda self: measured)
+    done = run(tmp_path)
+    assert RunDirectory(tmp_path / "runs" / "cube").read_result()["evaluation"] == {"mixed_success_last": 0.5}
+    assert Registry(tmp_path / "registry").manifest(str(done.version)).metrics["evaluation/mixed_success_last"] == 0.5
+
+
+def test_a_run_is_published_beside_a_redis_that_is_away(tmp_path, monkeypatch):
+    directory = RunDirectory(tmp_path / "runs" / "cube")
+    train(tiny_config(), directory, tmp_path / "registry", publish=False, on_iteration=lambda metrics: None)
+    monkeypatch.setenv("TANDEM_REDIS_URL", "redis://127.0.0.1:1/0")
+    version = publish_learned(tmp_path / "runs" / "cube", tmp_path / "registry", metrics={})
+    assert status(tmp_path).published == str(version) == "tiny@1"
 
 
 def test_a_second_signal_is_an_interruption(tmp_path):

@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 
-from service.base.errors import TandemError
+from service.base.errors import StorageError, TandemError
 from service.config import parse_config
 from service.policies.numpy_policy import numpy_bob
 from service.registry.loading import load
@@ -31,6 +31,22 @@ def trained(tmp_path_factory):
     run.close()
     version = publish_run(run.directory, Registry(root / "registry"), run.config, run.method.parameters(), {})
     return root, run.directory, version
+
+
+def test_a_version_whose_publisher_was_cut_off_becomes_the_latest(tmp_path, monkeypatch):
+    run, _ = play(tmp_path / "run")
+    registry, found = Registry(tmp_path / "registry"), load(str(tmp_path / "run"))
+
+    def cut_off(*_, **__):
+        raise StorageError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Registry, "_move_alias", cut_off)
+        with pytest.raises(StorageError):
+            publish_run(run.directory, registry, found.config, found.parameters, {})
+    assert (len(registry.versions("tiny")), registry.aliases("tiny")) == (1, {})
+    published = publish_run(run.directory, registry, found.config, found.parameters, {})
+    assert (len(registry.versions("tiny")), registry.aliases("tiny")) == (1, {"latest": published.number})
 
 
 def test_a_run_with_more_to_see_is_exact_when_resumed(tmp_path):

@@ -254,17 +254,19 @@ def test_the_best_is_chosen_by_the_selections_goals_alone():
     assert best_of({"4": a_run("push", 0, 1.0)}) is None
 
 
-def test_goals_that_choose_are_not_those_that_are_reported(monkeypatch, tmp_path):
+@pytest.mark.parametrize(("fixture", "goals"), [("none", "mixed"), ("wall", "table")])
+def test_goals_that_choose_are_not_those_that_are_reported(monkeypatch, tmp_path, fixture, goals):
     asked = []
 
     def evaluate(policy, world, kind, *, num_episodes, num_steps, success_distance_m, seed, num_threads):
         asked.append((kind, num_episodes, num_steps, seed))
         return an_evaluation(0.5, goals=kind)
 
-    play(tmp_path, tiny_config(total_env_steps=120))
+    config = tiny_config(total_env_steps=120)
+    play(tmp_path, config.model_copy(update={"world": config.world.model_copy(update={"fixture": fixture})}))
     monkeypatch.setattr("service.actors.evaluation.evaluate", evaluate)
     assert select(tmp_path) == {"selection_success_last": 0.5, "selection_mean_distance_m": 0.1}
-    assert asked == [("mixed", 1000, 2, SELECTION_SEED)]
+    assert asked == [(goals, 1000, 2, SELECTION_SEED)]
     # recorded figures are of these goals, and what chose is not what is reported
     assert (EVALUATION_SEED, REPORTED_SEED, SELECTION_SEED) == (1_000_003, 1_000_004, 1_000_005)
 
@@ -273,7 +275,7 @@ def test_a_better_run_found_by_a_resume_becomes_the_next_version(tmp_path):
     registry, study = Registry(tmp_path / "registry"), begin_study(tmp_path / "study")
     result = {"mixed_success_last": 0.5, "selection_success_last": 0.75, "selection_mean_distance_m": 0.1}
     run = StudyRun(settings={}, state="finished", env_steps=120, result=result)
-    published, metrics = [], published_metrics(run)
+    published, metrics = [], published_metrics(run, "mixed")
     for seed in (0, 1):
         directory = study.path / f"seed-{seed}"
         play(directory, tiny_config(seed=seed, total_env_steps=120))

@@ -11,7 +11,8 @@ from service.base.lock import claim_epoch
 from service.config import load_config
 from service.store import run_directory
 from service.store.run_directory import Published, Resumption, RunDirectory
-from tests.runs.runs import assert_one_line, no_room_above, read_lines, tiny_config
+from service.store.run_writer import RunWriter
+from tests.runs.runs import assert_one_line, no_permission, no_room_above, read_lines, tiny_config
 
 
 @pytest.fixture
@@ -219,3 +220,19 @@ def test_closing_on_a_full_disk_does_not_hide_why_the_run_ended(directory, caplo
     record(resumed, 2)
     resumed.close()
     assert [row["iteration"] for row in read_lines(directory.metrics_file)] == [2]
+
+
+def test_a_directory_that_may_not_be_read_for_a_while_ends_no_run(directory, caplog):
+    """``Path.exists`` and its like raise there, before Python 3.14."""
+    record(directory, 1)
+    writer = RunWriter(directory)
+    with no_permission(directory.path):
+        record(directory, 2)
+        directory.dump_diverged("000000", ((np.arange(4.0), np.zeros(4)),))
+        directory.sync()
+        assert not writer.stop_requested()
+    assert "Permission denied" in caplog.text
+    record(directory, 3)
+    assert [row["iteration"] for row in read_lines(directory.metrics_file)] == [1, 2, 3]
+    with no_permission(directory.path):
+        directory.close()

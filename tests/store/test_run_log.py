@@ -8,6 +8,7 @@ import pytest
 from service.store import run_log
 from service.store.run_directory import RunDirectory
 from service.store.run_log import logging_to, read_log
+from tests.runs.runs import no_room_above
 
 
 def said(directory):
@@ -50,6 +51,11 @@ def test_a_log_is_bounded(tmp_path, monkeypatch):
     texts = [text for _, text in said(tmp_path)]
     assert texts[-1] == "line 99"
     assert texts == [f"line {number}" for number in range(100 - len(texts), 100)]
+
+
+def test_a_full_disk_does_not_hide_why_a_run_failed(tmp_path):
+    with pytest.raises(ValueError, match="broke"), no_room_above(20), logging_to(tmp_path):  # its line does not fit
+        raise ValueError("it broke")
 
 
 def test_a_directory_that_is_gone_stops_nothing(tmp_path):
