@@ -56,7 +56,7 @@ class GameConfig(FrozenModel):
         ge=0.0,
         le=1.0,
         description="new games may have a blocked gripper while Bob's mean success rate over all goal cells, 0 where "
-        "Alice never was, is at least this; below, they keep him from learning to lift",
+        "no goal was proposed or tried, is at least this; below, they keep him from learning to lift",
     )
     bob_all_reward: float = Field(
         0.0, ge=0.0, description="of having all objects at their goals, besides that of each; OpenAI 2021: 5"

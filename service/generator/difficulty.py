@@ -122,7 +122,7 @@ class DifficultyGrid:
         return near.ravel()
 
     def mean_success_rate(self) -> float:
-        """Mean over all cells, 0 where there never was a goal: how much of the workspace Bob masters."""
+        """Mean over all cells, 0 where no goal was proposed or tried: how much of the workspace Bob masters."""
         known = self.seen | (self.counts.num_tries > 0)
         return float(np.where(known, self.counts.success_rate(), 0.0).mean())
 

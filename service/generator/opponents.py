@@ -52,17 +52,22 @@ class Opponents:
 
         Args:
             num_worlds: N.
-            fraction: share of worlds, each way; where it is not a whole number of worlds it is met on average.
+            fraction: share of worlds, each way, at most 0.5; where it is not a whole number of worlds it is met on
+                average.
             rng: source of the choice.
         """
         plan = RoundPlan(np.full(num_worlds, CURRENT), np.full(num_worlds, CURRENT))
         if not self.alice or fraction == 0.0:
             return plan
-        num_past = min(_round_at_random(fraction * num_worlds, rng), num_worlds // 2)
+        if num_worlds == 1:  # it meets one of them, or none
+            drawn = rng.random()
+            num_alice, num_bob = int(drawn < fraction), int(fraction <= drawn < 2 * fraction)
+        else:
+            num_alice = num_bob = min(_round_at_random(fraction * num_worlds, rng), num_worlds // 2)
         worlds = rng.permutation(num_worlds)
         # One past version each a round: every further one would cost another batch of inference in every step.
-        plan.alice_opponent[worlds[:num_past]] = rng.integers(len(self.alice))
-        plan.bob_opponent[worlds[num_past : 2 * num_past]] = rng.integers(len(self.alice))
+        plan.alice_opponent[worlds[:num_alice]] = rng.integers(len(self.alice))
+        plan.bob_opponent[worlds[num_alice : num_alice + num_bob]] = rng.integers(len(self.alice))
         return plan
 
     def joined_by(self, alice: Mapping[str, Array], bob: Mapping[str, Array], version: int, capacity: int) -> Opponents:

@@ -93,7 +93,7 @@ class GeneratorSnapshot:
     """(arrangements,) how rare they are among proposals; none of one object. Whatever cells she has seen: she stacks
     long after she has been everywhere."""
     success_rate: StateArray
-    """() mean over all cells, 0 where no goal was ever proposed."""
+    """() mean over all cells, 0 where no goal was proposed or tried."""
     coverage: StateArray
     """() share of the cells in which a goal was ever proposed."""
     near_reached: BoolArray

@@ -32,7 +32,7 @@ class Known:
     coverage: float
     """Share of the workspace's cells in which a goal was ever proposed."""
     success_rate: float
-    """Bob's, mean over all cells; 0 where no goal was proposed."""
+    """Bob's, mean over all cells; 0 where no goal was proposed or tried."""
     near: Callable[[StateArray], BoolArray]
     """Whether (M, 3 K) goals are in cells to which their objects were brought in a game, or beside one: (M,)."""
 

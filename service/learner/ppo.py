@@ -355,11 +355,13 @@ def _adapted_learning_rate(player: Player, kl: float) -> float:
 def _highest_learning_rate(player: Player, version: int) -> float:
     """The highest learning rate of an update: the upper bound, or less where the rate decays as 1 over their number.
 
+    It is never below the lower bound, within which a resumed player has its rate.
+
     With steps like these the average of where gradient steps come by goes to one point (Robbins and Monro 1951, Polyak
     and Juditsky 1992); with steps of one length it wanders.
     """
-    config, highest = player.config, player.config.learning_rate * LEARNING_RATE_BOUNDS[1]
-    return highest * min(1.0, (config.rate_decay_after_updates or math.inf) / (version + 1))
+    config, (low, high) = player.config, (player.config.learning_rate * bound for bound in LEARNING_RATE_BOUNDS)
+    return max(low, high * min(1.0, (config.rate_decay_after_updates or math.inf) / (version + 1)))
 
 
 def _join(turns: Sequence[Turns], name: str) -> Array:

@@ -40,6 +40,8 @@ class ReplayBuffer:
         self.num_steps, self.num_worlds = num_steps, num_worlds
         self.num_added = 0
         """Steps added so far, overwritten ones among them."""
+        self._first = 0
+        """Number of the first step that this buffer ever had: a larger one does not have all that came before it."""
         self._columns = {name: np.zeros((num_steps, num_worlds, size), np.float32) for name, size in columns.items()}
         self._last_step = np.full((num_steps, num_worlds), _GOES_ON, dtype=np.int32)  # of each transition's episode
         self._began = np.zeros(num_worlds, dtype=np.int64)
@@ -65,7 +67,7 @@ class ReplayBuffer:
     def draw(self, size: int, rng: np.random.Generator, *, newest: int | None = None) -> Places:
         """Draw ``size`` transitions, all alike, with replacement; of the newest steps of every world, or of all."""
         kept = self.num_steps if newest is None else min(self.num_steps, newest)
-        oldest = max(0, self.num_added - kept)
+        oldest = max(self._first, self.num_added - kept)
         flat = rng.integers(oldest * self.num_worlds, self.num_added * self.num_worlds, size)
         return Places(*np.divmod(flat, self.num_worlds))
 
@@ -91,13 +93,15 @@ class ReplayBuffer:
         """Everything a new buffer continues from, as arrays by name; rows that are not in use are left out."""
         used = min(self.num_added, self.num_steps)
         rows = {name: values[:used].copy() for name, values in self._columns.items()}
-        counted = {"num_added": np.array(self.num_added), "began": self._began.copy()}
+        counted = {"num_added": np.array(self.num_added), "first": np.array(self._first), "began": self._began.copy()}
         return {**rows, _LAST_STEP: self._last_step[:used].copy(), **counted}
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue from a buffer of as many worlds, with what fits of its newest steps."""
         self.num_added, self._began = int(state["num_added"]), np.array(state["began"], dtype=np.int64)
         num_saved = len(state[_LAST_STEP])
+        # states of before 28 November have no "first"
+        self._first = max(int(state.get("first", 0)), self.num_added - min(num_saved, self.num_steps))
         newest = np.arange(self.num_added - min(num_saved, self.num_steps), self.num_added)
         for name, values in {**self._columns, _LAST_STEP: self._last_step}.items():
             values[newest % self.num_steps] = state[name][newest % max(num_saved, 1)]

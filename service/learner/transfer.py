@@ -36,6 +36,11 @@ def take_over(
     """
     if before.num_objects != after.num_objects:
         return f"not taken, it was trained with {before.num_objects} objects, here is {after.num_objects}"
+    for seen in inputs:
+        old, new = getattr(before, seen), getattr(after, seen)
+        if old.size == new.size and old.columns != new.columns:  # by their shapes the weights would fit
+            others = ", ".join(sorted(new.columns.keys() - old.columns.keys()))
+            return f"not taken, it has as many inputs as before and others: {others}"
     own = network.state_dict()
     constants = {name for name, _ in network.named_buffers()}  # of the layout; a learner's state has none
     if missing := sorted((own.keys() ^ given.keys()) - constants):

@@ -164,10 +164,11 @@ def check_reward(config: SkillsConfig, code: Mapping[str, str]) -> IntrinsicRewa
         raise CodeError(f"{where}: goes on otherwise after load_state(state()): tensors() has to have all that changes")
     if not layers or not np.allclose(relu_layers(np, layers, rows.numpy()), found, atol=1e-4):
         raise CodeError(f"{where}.make_network: only torch.nn.Linear with torch.nn.ReLU between them can be exported")
-    if reward.zero_shot == "way" and (rows.shape[1], found.shape[1]) != (STATE_SIZE, config.size):
+    if reward.zero_shot != "none" and (rows.shape[1], found.shape[1]) != (STATE_SIZE, config.size):
         raise CodeError(
-            f"{where}.make_network: maps {rows.shape[1]} numbers to {found.shape[1]}; with zero_shot = 'way' it has to "
-            f"map the {STATE_SIZE} of a place to the {config.size} of a skill: do so, or set zero_shot = 'none'"
+            f"{where}.make_network: maps {rows.shape[1]} numbers to {found.shape[1]}; with zero_shot = "
+            f"{reward.zero_shot!r} it has to map the {STATE_SIZE} of a place to the {config.size} of a skill: do so, "
+            "or set zero_shot = 'none'"
         )
     return reward
 

@@ -107,7 +107,7 @@ class SkillTaskWorlds(TaskWorlds):
         """Hold the skills of (N, Z) actions; rewards are summed.
 
         A world whose episode ends on the way plays on in its next one, by the same skill: the learner sees that one
-        from where it then is.
+        from where it then is, and the rewards until then count nowhere.
         """
         skill = self._skills.from_action(actions)
         total = super().advance(self._skills.actions(self.previous, self.positions, skill))

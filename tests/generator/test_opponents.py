@@ -35,7 +35,7 @@ def test_no_past_opponents_while_the_pool_is_empty_or_the_fraction_zero() -> Non
 
 
 @pytest.mark.parametrize(
-    ("num_worlds", "fraction", "num_past"), [(160, 0.2, 32), (30, 0.1, 3), (10, 0.5, 5), (1, 0.5, 0), (5, 0.2, 1)]
+    ("num_worlds", "fraction", "num_past"), [(160, 0.2, 32), (30, 0.1, 3), (10, 0.5, 5), (5, 0.2, 1)]
 )
 def test_shares_are_exact_and_disjoint(num_worlds: int, fraction: float, num_past: int) -> None:
     pool = opponents(5)
@@ -50,6 +50,14 @@ def test_a_broken_share_is_met_on_average() -> None:
     drawn = [int(pool.plan(6, 0.2, rng).alice_past.sum()) for _ in range(2000)]
     assert set(drawn) == {1, 2}
     assert np.mean(drawn) == pytest.approx(1.2, abs=0.03)
+
+
+def test_a_single_world_meets_them_as_often_as_each_of_many() -> None:
+    pool, rng = opponents(5), np.random.default_rng(1)
+    plans = [pool.plan(1, 0.2, rng) for _ in range(2000)]
+    for past in ([plan.alice_past for plan in plans], [plan.bob_past for plan in plans]):
+        assert np.mean(past) == pytest.approx(0.2, abs=0.03)
+    assert not any((plan.alice_past & plan.bob_past).any() for plan in plans)
 
 
 def test_every_snapshot_and_world_is_drawn() -> None:

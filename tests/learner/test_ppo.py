@@ -268,7 +268,8 @@ def test_learning_rate_follows_the_kl_within_bounds(target_kl, num_updates, mult
 
 @pytest.mark.parametrize(
     ("version", "multiple"),
-    [(2, 2.0), (3, 2.0), (7, 1.0), (39, 0.2)],  # of updates 3, 4, 8, 40: twice the rate, times 4 / number at most
+    # of updates 3, 4, 8, 40: twice the rate, times 4 / number at most; of update 1,000 the lower bound
+    [(2, 2.0), (3, 2.0), (7, 1.0), (39, 0.2), (999, 0.03)],
 )
 def test_a_player_that_settles_has_a_learning_rate_that_falls_with_the_number_of_updates(version, multiple):
     player, rng = make_player(target_kl=1e3, num_epochs=1, rate_decay_after_updates=4), np.random.default_rng(0)

@@ -74,5 +74,9 @@ def test_a_buffer_of_another_size_takes_the_newest_steps(num_steps, kept):
     step, world = (each.ravel() for each in np.meshgrid(list(kept), range(NUM_WORLDS)))
     places = Places(step, world)
     np.testing.assert_array_equal(second.read(places)["at"], np.stack(places, axis=1))
+    again = ReplayBuffer(20, NUM_WORLDS, {"at": 2})
+    again.load_state(second.state())  # it was stopped, and goes on once more
+    for replay in (second, again):  # nothing is drawn that it never had
+        assert set(replay.draw(500, np.random.default_rng(0)).step.tolist()) == set(kept)
     later = second.draw_later(Places(np.full(99, 7), np.zeros(99, dtype=int)), np.random.default_rng(0))
     assert set(later.step.tolist()) == {7, 8}

@@ -76,6 +76,18 @@ def test_inputs_that_are_gone_are_left_out():
     torch.testing.assert_close(outputs(new, rows), outputs(trained, wider))
 
 
+def test_other_inputs_of_the_same_number_are_not_taken_for_the_old_ones():
+    obstacle, command = Layouts(num_obstacles=1, delay=True), Layouts(num_commands=1)
+    assert obstacle.bob.size == command.bob.size
+    torch.manual_seed(0)
+    trained, new = networks.make_bob(SMALL, obstacle), networks.make_bob(SMALL, command)
+    before = networks.export_parameters(new)
+    said = take_over(new, networks.export_parameters(trained), obstacle, command, BOB_INPUTS)
+    assert said == "not taken, it has as many inputs as before and others: command_1"
+    for name, array in networks.export_parameters(new).items():
+        np.testing.assert_array_equal(array, before[name])
+
+
 def test_other_sizes_are_not_taken_and_said():
     torch.manual_seed(0)
     other = SMALL.model_copy(update={"bob": SMALL.bob.model_copy(update={"num_primitives": 4})})

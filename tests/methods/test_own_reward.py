@@ -113,14 +113,17 @@ def test_a_method_that_there_is_not(file):
     assert_one_line(error.value, "skills.method 'metrra': choose one of lsd, diayn, dads, metra, csf, or FILE.py:CLASS")
 
 
-def test_a_network_that_leads_to_no_goal_says_so(file, tmp_path):
+@pytest.mark.parametrize("word", ["way", "place"])
+def test_a_network_that_leads_to_no_goal_says_so(file, tmp_path, word):
     """Or whoever plays the skills finds out."""
-    file.write_text("""
+    file.write_text(f"""
 import torch
 from torch import nn
 from service.methods.intrinsic_reward import IntrinsicReward
 
 class Upwards(IntrinsicReward):
+    zero_shot = {word!r}
+
     def make_network(self):
         return nn.Sequential(nn.Linear(6, 8), nn.ReLU(), nn.Linear(8, 1))
 
@@ -132,4 +135,4 @@ class Upwards(IntrinsicReward):
 """)
     with pytest.raises(TandemError) as error:
         load_config(None, SMALL).begin(tmp_path / "registry", None)
-    assert_one_line(error.value, "make_network: maps 6 numbers to 1; with zero_shot = 'way' it has to map the 3 of a")
+    assert_one_line(error.value, f"make_network: maps 6 numbers to 1; with zero_shot = {word!r} it has to map the 3 of")
