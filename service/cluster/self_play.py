@@ -54,7 +54,7 @@ RESIZE_S = 5.0
 MAX_ATTEMPTS = 3
 """Learners or generators in a row that may die of the same iteration."""
 MAX_FAILED_ROUNDS = 20
-"""Rounds, or starts of actors, in a row that may fail."""
+"""Rounds, or starts of actors, in a row that may fail, beside one of each actor: all of a lost node fail at once."""
 
 
 class RaySelfPlay(SelfPlay):
@@ -238,9 +238,9 @@ class RaySelfPlay(SelfPlay):
             if lost(error):
                 raise StateLostError(f"weights or goals went with the machine that kept them ({reason})") from None
             self._num_failed_rounds += 1
-            if self._num_failed_rounds > MAX_FAILED_ROUNDS:
+            if self._num_failed_rounds > MAX_FAILED_ROUNDS + len(self._pool):
                 raise WorkersError(
-                    f"{MAX_FAILED_ROUNDS + 1} rollout actors in a row failed, at last with: {reason}"
+                    f"{self._num_failed_rounds} rollout actors in a row failed, at last with: {reason}"
                 ) from None
             self._replace(slot, reason)
 

@@ -1,9 +1,19 @@
-"""The lag of rollouts, bounded by counting them."""
+"""Actors without Ray: the lag of rollouts, bounded by counting them, and which failures end the run."""
+
+from types import SimpleNamespace
 
 import pytest
+import ray
+from ray.exceptions import ActorDiedError
 
 from service.actors.rollout import MAX_POLICY_LAG
+from service.cluster import actor_pool
+from service.cluster.actor_pool import ActorPool
 from service.cluster.iteration import may_begin, may_update
+from service.cluster.ray_connection import ClusterOptions
+from service.cluster.self_play import MAX_FAILED_ROUNDS, RaySelfPlay
+from service.methods.method import WorkersError
+from tests.runs.runs import tiny_config
 
 
 def test_an_update_waits_for_a_round_that_would_get_too_old():
@@ -38,3 +48,31 @@ def test_no_order_of_events_lets_a_rollout_get_too_old(num_actors, slowness):
         assert sum(lags) / len(lags) <= 1
     if num_actors == 1:
         assert set(lags) == {0, 1}  # one round is played while another is learned from, never two
+
+
+@pytest.fixture
+def method(monkeypatch):
+    """A driver without Ray and with no actors yet, of which none ever starts: each dies when it is asked for that."""
+
+    def dies(reference):
+        raise ActorDiedError
+
+    handle = SimpleNamespace(ping=SimpleNamespace(remote=object))
+    monkeypatch.setattr(actor_pool, "remote_actor", lambda *_, **__: SimpleNamespace(remote=lambda *_: handle))
+    monkeypatch.setattr(ray, "kill", lambda handle: None)
+    monkeypatch.setattr(ray, "get", dies)
+    method = RaySelfPlay(tiny_config(), ClusterOptions())
+    method._pool = ActorPool(method.config, 1, 0, method._clock)
+    return method
+
+
+def test_all_actors_of_a_node_may_fail_at_once_and_not_for_ever(method):
+    method._pool.resize(MAX_FAILED_ROUNDS + 10)
+
+    def lose_all():
+        for slot in list(method._pool):
+            method._take_from_actor(slot, {slot.starting})
+
+    lose_all()
+    with pytest.raises(WorkersError, match=f"^{2 * MAX_FAILED_ROUNDS + 11} rollout actors in a row failed"):
+        lose_all()
