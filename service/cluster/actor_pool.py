@@ -173,11 +173,19 @@ class ActorPool:
         free = [index for index in range(num) if index not in self._slots]
         self._slots |= {index: self._spawn(index) for index in free[: max(0, num - len(self._slots))]}
 
-    def replace(self, slot: ActorSlot, reason: str) -> None:
-        """Kill a slot's actor and spawn the next incarnation."""
+    def replace(self, slot: ActorSlot, reason: str | None) -> None:
+        """Kill a slot's actor and spawn the next incarnation.
+
+        Args:
+            slot: whose actor it is.
+            reason: why it failed; None: it only has not started, so its incarnation, which made no rollout, comes again.
+        """
         ray.kill(slot.watch.handle)
+        if reason is None:
+            self._incarnations[slot.index] = slot.watch.incarnation
         new = self._spawn(slot.index)
-        new.num_rollouts, new.num_env_steps, new.last_error = slot.num_rollouts, slot.num_env_steps, reason
+        new.num_rollouts, new.num_env_steps = slot.num_rollouts, slot.num_env_steps
+        new.last_error = reason or slot.last_error
         if not slot.alive:
             new.may_start_s = 2.0 * slot.may_start_s
         self._slots[slot.index] = new

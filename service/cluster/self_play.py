@@ -368,8 +368,11 @@ class RaySelfPlay(SelfPlay):
             if slot.overdue and not slot.late:
                 slot.late = True
                 _logger.info("rollout actor %d is late; updates go on without it", slot.index)
-            if (reason := slot.look()) is not None:
+            if (reason := slot.look()) is not None and slot.alive:
                 self._replace(slot, reason)
+            elif reason is not None:  # most likely it waits for a core, which is no failure
+                _logger.info("rollout actor %d: %s; it is started anew", slot.index, reason)
+                self._pool.replace(slot, None)
         now = time.monotonic()
         if now - self._last_resize >= RESIZE_S:
             self._last_resize = now

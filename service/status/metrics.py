@@ -66,7 +66,10 @@ def _age_s(when: datetime) -> float:
 
 
 def _actor_age_s(run: RunStatus) -> float | None:
-    return max((_age_s(actor.heartbeat) for actor in run.actors), default=None) if run.state in ACTIVE else None
+    """Of those that have started: others may wait for a core for as long as the run goes on."""
+    if run.state not in ACTIVE:
+        return None
+    return max((_age_s(actor.heartbeat) for actor in run.actors if actor.state == "alive"), default=None)
 
 
 RUN_METRICS: tuple[RunMetric, ...] = (
@@ -90,7 +93,7 @@ RUN_METRICS: tuple[RunMetric, ...] = (
     _run("rollouts_refused_total", "Rollouts seen before, or too old", lambda run, _: run.totals.rollouts_refused),
     _run("actor_replacements_total", "How often an actor, the learner or the generator was replaced",
          lambda run, _: run.totals.replacements),
-    _run("actor_heartbeat_age_seconds", "Seconds since the oldest heartbeat of an active run's actors",
+    _run("actor_heartbeat_age_seconds", "Seconds since the oldest heartbeat of an active run's actors that have started",
          lambda run, _: _actor_age_s(run)),
     _of_record("valid_goals_ratio", "alice/valid_fraction", "Fraction of Alice's goals that are valid"),
     _of_record("lifted_goals_ratio", "alice/lifted_fraction", "Fraction of valid goals that are in the air"),

@@ -426,18 +426,21 @@ def test_actors_that_wait_for_a_core_do_not_end_the_run(tmp_path, monkeypatch):
     monkeypatch.setattr(actor_pool, "START_GRACE_S", 0.5)
     monkeypatch.setattr(actor_pool, "RESTART_S", 0.1)
     monkeypatch.setattr(self_play, "MAX_FAILED_ROUNDS", 1)
-    warnings = set()
+    warnings, slots, incarnations = set(), set(), set()
 
     def hurry(run):
-        while sum(slot.watch.incarnation for slot in run.method._pool) < 4:
+        while len(slots) < 7:
             yield
             for slot in run.method._pool:
                 slot.may_start_s = min(slot.may_start_s, 1.0)
+            slots.update(run.method._pool)
+            incarnations.update(actor.incarnation for actor in run.method.health().actors)
             warnings.update(run.method.health().warnings)
 
     _, result = run_cluster(tmp_path, story=hurry, num_actors=3, threads=3)
     assert result.reason == "interrupted"
     assert "2 of 3 rollout actors wait for a free core" in warnings
+    assert incarnations == {0}  # none of them counts as replaced
 
 
 def test_a_raylet_that_is_frozen_is_silent_and_one_that_stays_so_is_given_up(monkeypatch):

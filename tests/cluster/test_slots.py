@@ -8,7 +8,7 @@ from ray.exceptions import ActorDiedError
 
 from service.actors.rollout import MAX_POLICY_LAG
 from service.cluster import actor_pool
-from service.cluster.actor_pool import ActorPool
+from service.cluster.actor_pool import RESTART_S, ActorPool
 from service.cluster.iteration import may_begin, may_update
 from service.cluster.ray_connection import ClusterOptions
 from service.cluster.self_play import MAX_FAILED_ROUNDS, RaySelfPlay
@@ -76,3 +76,24 @@ def test_all_actors_of_a_node_may_fail_at_once_and_not_for_ever(method):
     lose_all()
     with pytest.raises(WorkersError, match=f"^{2 * MAX_FAILED_ROUNDS + 11} rollout actors in a row failed"):
         lose_all()
+
+
+def test_a_start_that_waits_for_a_core_is_no_failure_and_one_that_dies_is(method):
+    worker = SimpleNamespace(end_if_hung=lambda: None)
+    method._learner = method._generator = worker
+    method._last_resize = float("inf")
+    method._pool.resize(1)
+    (first,) = method._pool
+    method._clock.now = RESTART_S + 1.0
+    method._check_workers()
+    (again,) = method._pool
+    assert again is not first
+    assert (again.watch.incarnation, again.last_error, method._last_error) == (0, None, None)
+    method._take_from_actor(again, {again.starting})
+    (replaced,) = method._pool
+    assert replaced.watch.incarnation == 1
+    assert "died" in replaced.last_error
+    method._clock.now *= 10.0
+    method._check_workers()
+    (last,) = method._pool
+    assert (last.watch.incarnation, last.last_error) == (1, replaced.last_error)

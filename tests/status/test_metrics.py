@@ -95,6 +95,16 @@ def test_actors_of_an_ended_run_cause_no_alert(service):
     ] == []
 
 
+def test_an_actor_that_has_not_started_is_not_silent(service):
+    client, runs = service
+    alive, starting, learner = status("cube").actors
+    long_ago = starting.model_copy(update={"heartbeat": starting.heartbeat - timedelta(hours=1)})
+    write_status(runs, "cube", actors=(alive, long_ago, learner))
+    assert value(scrape(client), "tandem_run_actor_heartbeat_age_seconds", run="cube") < 1800
+    write_status(runs, "cube", actors=(long_ago,))
+    assert ("tandem_run_actor_heartbeat_age_seconds", ("run", "cube")) not in scrape(client)
+
+
 def test_the_registry(tmp_path, home):
     with serve(home) as server, httpx.Client(base_url=server.url, **CLIENT) as client:
         samples = scrape(client)
