@@ -178,7 +178,7 @@ class ActorPool:
 
         Args:
             slot: whose actor it is.
-            reason: why it failed; None: it only has not started, so its incarnation, which made no rollout, comes again.
+            reason: why it failed; None: it only has not started. Its incarnation made no rollout, and comes again.
         """
         ray.kill(slot.watch.handle)
         if reason is None:

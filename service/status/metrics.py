@@ -93,7 +93,7 @@ RUN_METRICS: tuple[RunMetric, ...] = (
     _run("rollouts_refused_total", "Rollouts seen before, or too old", lambda run, _: run.totals.rollouts_refused),
     _run("actor_replacements_total", "How often an actor, the learner or the generator was replaced",
          lambda run, _: run.totals.replacements),
-    _run("actor_heartbeat_age_seconds", "Seconds since the oldest heartbeat of an active run's actors that have started",
+    _run("actor_heartbeat_age_seconds", "Seconds since the oldest heartbeat of the actors of an active run that are up",
          lambda run, _: _actor_age_s(run)),
     _of_record("valid_goals_ratio", "alice/valid_fraction", "Fraction of Alice's goals that are valid"),
     _of_record("lifted_goals_ratio", "alice/lifted_fraction", "Fraction of valid goals that are in the air"),
@@ -201,9 +201,10 @@ class Telemetry(Collector):
 
 
 def shown(runs: list[RunStatus]) -> list[RunStatus]:
-    """Select, newest first, active runs and the last ``NUM_ENDED_RUNS`` that ended; at most ``MAX_RUNS``."""
+    """Select active runs, as they are listed, and the last ``NUM_ENDED_RUNS`` that ended; at most ``MAX_RUNS``."""
     active = [run for run in runs if run.state in ACTIVE]
-    ended = [run for run in runs if run.state not in ACTIVE]
+    # Not by their start, by which they are listed: a long run that failed just now would be gone before its alert.
+    ended = sorted((run for run in runs if run.state not in ACTIVE), key=lambda run: run.heartbeat, reverse=True)
     return (active + ended[:NUM_ENDED_RUNS])[:MAX_RUNS]
 
 

@@ -147,9 +147,9 @@ def test_a_damaged_registry(service):
 
 
 def test_the_number_of_series_is_bounded():
-    when = datetime(2026, 1, 1, tzinfo=UTC)
+    when, hour = datetime(2026, 1, 1, tzinfo=UTC), timedelta(hours=1)
     runs = [
-        status(f"run-{number}", state=state, started=when - timedelta(hours=number))
+        status(f"run-{number}", state=state, started=when - number * hour, heartbeat=when - number * hour)
         for number, state in enumerate(["finished", "running"] * 100)
     ]
     ids = [run.run_id for run in metrics.shown(runs)]
@@ -157,6 +157,15 @@ def test_the_number_of_series_is_bounded():
     assert ids[:2] == ["run-1", "run-3"]
     ids = [run.run_id for run in metrics.shown(runs[:20])]
     assert ids == [f"run-{n}" for n in range(1, 20, 2)] + [f"run-{n}" for n in range(0, 2 * NUM_ENDED_RUNS, 2)]
+
+
+def test_a_long_run_that_failed_just_now_is_shown():
+    when, hour = datetime(2026, 1, 1, tzinfo=UTC), timedelta(hours=1)
+    ended = [when - number * hour for number in range(9)]
+    short = [status(f"wall-{n}", state="finished", started=at, heartbeat=at) for n, at in enumerate(ended)]
+    failed = status("cube", state="failed", started=when - 10 * hour, heartbeat=when)
+    ids = [run.run_id for run in metrics.shown([*short, failed])]
+    assert ids == ["wall-0", "cube", "wall-1", "wall-2", "wall-3"]
 
 
 def test_everything_served_is_in_the_reference(service):
