@@ -116,6 +116,13 @@ def test_every_condition_of_a_run_has_an_alert():
     assert {found[1] for found in asked if found is not None} == set(CONDITIONS) - {"well"}
 
 
+def test_what_is_missing_is_missed_only_of_runs_that_had_it():
+    asked = [rule["expr"] for _, rule in ALERTS]
+    missed = [(each, name) for each in asked for name in re.findall(r"unless on \(run\) (\w+)", each)]
+    assert missed
+    assert all(f"max_over_time({name}[" in each for each, name in missed)
+
+
 def test_every_trouble_has_an_alert_that_was_seen_to_fire():
     text = (ROOT / "tests" / "deploy" / "alerts_test.yml").read_text()
     fired = set(re.findall(r'alertname(?:=|: )"?(\w+)', text))
