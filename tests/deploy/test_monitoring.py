@@ -123,6 +123,12 @@ def test_what_is_missing_is_missed_only_of_runs_that_had_it():
     assert all(f"max_over_time({name}[" in each for each, name in missed)
 
 
+def test_only_the_alert_about_redis_sends_people_there():
+    """Without Redis the service reads the run directories, and ``tandem_store_up`` stays 1."""
+    summaries = {rule["alert"]: rule["annotations"]["summary"] for _, rule in ALERTS}
+    assert [alert for alert, summary in summaries.items() if "Redis" in summary] == ["RunWithoutRedis"]
+
+
 def test_every_trouble_has_an_alert_that_was_seen_to_fire():
     text = (ROOT / "tests" / "deploy" / "alerts_test.yml").read_text()
     fired = set(re.findall(r'alertname(?:=|: )"?(\w+)', text))
