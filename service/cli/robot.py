@@ -208,7 +208,8 @@ def _connected(
                 key.wait()
             elif not harmless:
                 typer.echo(f"{what}, then press Enter", err=True)
-                sys.stdin.readline()
+                if not sys.stdin.readline():
+                    raise TandemError("standard input has ended, so nobody can press Enter: run this in a terminal")
 
         yield backend, key or always_held, wait
 

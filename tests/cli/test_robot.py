@@ -140,6 +140,10 @@ def test_a_real_robot_wants_a_dead_mans_switch_and_a_person(monkeypatch):
     assert dry.stderr.count("would go to") == 2
     assert robot.commands == robot.stops == []
     asked = ("run", "--robot", "their:robot", "--goal", "0,0,0.2", "--steps", "3", "--dead-man", "none")
+    alone = invoke(*asked, answers="")
+    assert alone.exit_code == 2, alone.output
+    assert alone.stderr.endswith("error: standard input has ended, so nobody can press Enter: run this in a terminal\n")
+    assert robot.commands == []
     ran = invoke(*asked, answers="\n")
     assert ran.exit_code == 0, ran.output
     assert "put arm and object to their start, then press Enter" in ran.stderr
