@@ -90,11 +90,12 @@ TaskOption = Annotated[
 
 
 def quieten(quiet: bool) -> bool:
-    """Show no progress from now on, if so; no messages but warnings and errors."""
+    """Show no progress from now on, if so, and print no messages but warnings and errors; a run's log has all."""
     shown = display()
     if quiet and shown is not None:
         shown.quiet = True
-        logging.getLogger().setLevel(logging.WARNING)
+        for handler in logging.getLogger().handlers:
+            handler.setLevel(logging.WARNING)
     return quiet
 
 

@@ -1,5 +1,6 @@
 """Names that are typed: configurations that come with tandem, and what a misspelt name was meant to be."""
 
+import io
 import json
 import logging
 import os
@@ -10,13 +11,17 @@ from pathlib import Path
 
 import pytest
 import typer
+from rich.console import Console
 
 from service.base.errors import TandemError, did_you_mean
+from service.base.progress import Display
 from service.base.version import __version__
+from service.cli.common import quieten
 from service.cli.configs import named
 from service.cli.main import app
 from service.config import load_config
 from service.config.recipes import CONFIGS, recipes, robots
+from service.store.run_log import logging_to, read_log
 from tests.cli.typed import assert_refused, tandem
 
 RECIPE = CONFIGS / "pretrain" / "panda_cube.yaml"
@@ -144,12 +149,22 @@ def test_quiet_before_and_after_the_command(monkeypatch, tmp_path):
     monkeypatch.setattr("service.base.progress.PLAIN_INTERVAL_S", 0.0)
     typed = ["evaluate", "panda-cube@champion", "--episodes", "1", "--steps", "1"]
     assert "evaluating on mixed goals" in tandem(*typed).stderr
-    level = logging.getLogger().level
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
     for arguments in (["-q", *typed], [*typed, "-q"]):
         done = tandem(*arguments)
         assert (done.exit_code, done.stderr) == (0, "")
         assert "at the last step" in done.stdout
-    logging.getLogger().setLevel(level)
+
+
+def test_what_quiet_does_not_print_is_in_the_log_of_the_run(monkeypatch, tmp_path, caplog):
+    printed = io.StringIO()
+    monkeypatch.setattr(logging.getLogger(), "handlers", [logging.StreamHandler(printed)])
+    with caplog.at_level(logging.INFO), Display(Console(file=io.StringIO())), logging_to(tmp_path):  # as in main
+        quieten(True)
+        logging.getLogger("service.cluster").info("rollout actor 3 is back")
+        logging.getLogger("service.cluster").warning("rollout actor 3 is gone")
+    assert [line.text for line in read_log(tmp_path)] == ["rollout actor 3 is back", "rollout actor 3 is gone"]
+    assert printed.getvalue() == "rollout actor 3 is gone\n"
 
 
 def test_the_version():
