@@ -29,7 +29,9 @@ from service.runs.signals import StopSignals
 
 
 def serve(
-    runs: Annotated[Path, typer.Option(metavar="DIR", help="Directory of run directories.")] = Path("runs"),
+    runs: Annotated[
+        Path, typer.Option(envvar="TANDEM_RUNS", metavar="DIR", help="Directory of run directories.")
+    ] = Path("runs"),
     registry: RegistryOption = REGISTRY,
     host: Annotated[str, typer.Option(help="Where to listen; others than this machine need a token.")] = "127.0.0.1",
     port: Annotated[

@@ -163,6 +163,10 @@ def test_one_clear_error(arguments, parts, monkeypatch):
     assert_refused(tandem("serve", *arguments, "--port", "0"), *parts)
 
 
+def test_it_serves_the_directory_in_which_tandem_train_makes_runs():
+    assert_refused(tandem("serve", "--port", "0", TANDEM_RUNS="no/such/runs"), "no directory no/such/runs")
+
+
 def test_a_token_is_never_on_the_command_line():
     result = tandem("serve", "--help", NO_COLOR="1", COLUMNS="120")
     assert re.findall(r"--[a-z-]*token[a-z-]*", result.stdout) == ["--token-file"]
