@@ -256,10 +256,18 @@ def _write_traceback(error: Exception, directory: Path) -> str:
     return path
 
 
-def how_to_go_on(run_dir: Path, registry: Path | str, *, runtime: str = "local", address: str | None = None) -> str:
-    """The command that continues a run or a study, where it was begun."""
-    place = ["--runtime", runtime] * (runtime != "local") + (["--address", address] if address is not None else [])
-    command = ["tandem", "train", "--resume", "--run-dir", str(run_dir), "--registry", str(registry), *place]
+def how_to_go_on(
+    run_dir: Path,
+    registry: Path | str,
+    *,
+    publish: bool | None = None,
+    runtime: str = "local",
+    address: str | None = None,
+) -> str:
+    """The command that continues a run or a study, where it was begun; ``publish`` is None for its default."""
+    command = ["tandem", "train", "--resume", "--run-dir", str(run_dir), "--registry", str(registry)]
+    command += [] if publish is None else ["--publish" if publish else "--no-publish"]
+    command += ["--runtime", runtime] * (runtime != "local") + (["--address", address] if address is not None else [])
     return f"continue with: {shlex.join(command)}"
 
 

@@ -107,7 +107,9 @@ def train_study(
     registry = _registry(source, configs.values(), publish)
     where = source if is_service(source) else str(Path(source).absolute())
     options = ["--registry", where, *(part for tracker in trackers for part in ("--tracker", tracker))]
-    hint = how_to_go_on(study.path, source, runtime="ray" if cluster is not None else "local", address=address)
+    runtime = "ray" if cluster is not None else "local"
+    typed = None if publish else publish  # it publishes its best run anyway
+    hint = how_to_go_on(study.path, source, publish=typed, runtime=runtime, address=address)
     told = cluster() if cluster is not None else None  # reads the status service's token
     try:
         with closing(study), traceback_in(study.path), ExitStack() as stack:

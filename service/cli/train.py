@@ -212,8 +212,6 @@ def train(
 
             start = load(start_from, source).expect("primitives", by="--from") if start_from is not None else None
             resolved = load_config(begun, overrides).begin(source, start)
-    if publish is None:
-        publish = resolved.makes != "orchestrator"
     train_and_tell(
         resolved, directory, source, resume=again, publish=publish, start=start, trackers=trackers,
         cluster=cluster_options() if runtime == "ray" else None, address=address,
@@ -226,21 +224,27 @@ def train_and_tell(
     registry: Path | str,
     *,
     resume: bool,
-    publish: bool = True,
+    publish: bool | None = None,
     start: Trained | None = None,
     trackers: Sequence[str] = (),
     cluster: ClusterOptions | None = None,
     address: str | None = None,
     until: OnIteration = lambda metrics: None,
 ) -> Finished:
-    """Train, show how far that is, and say what came out, or how to go on."""
+    """Train, show how far that is, and say what came out, or how to go on.
+
+    ``publish`` is None for all but policies of tasks.
+    """
     with loading():
         from service.runs import train as training
         from service.store.disk_reader import run_id_of
 
     runtime = training.Runtime()
     where = "local" if cluster is None else "ray"
-    hint = how_to_go_on(directory.path, registry, runtime=where, address=address)
+    by_default = config.makes != "orchestrator"
+    publish = by_default if publish is None else publish
+    typed = None if publish == by_default else publish
+    hint = how_to_go_on(directory.path, registry, publish=typed, runtime=where, address=address)
     try:
         with traceback_in(directory.path), closing(directory), ExitStack() as stack:
             if cluster is not None:

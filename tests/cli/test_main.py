@@ -225,15 +225,10 @@ def test_what_is_wrong_with_the_directory_or_with_ray_is_said_and_leaves_nothing
     lock.release()
 
 
-@pytest.mark.parametrize(
-    ("options", "hint"),
-    [
-        ((), ""),
-        (("--runtime", "ray", "--address", "head:6379", "--status", "off"), " --runtime ray --address head:6379"),
-    ],
-)
-@pytest.mark.parametrize("seeds", [(), ("--seeds", "0,1")])
-def test_how_to_go_on_is_where_the_run_was_begun(tmp_path, monkeypatch, options, hint, seeds):
+@pytest.fixture
+def stopped_at_once(monkeypatch):
+    """A signal ends every training as it begins."""
+
     def stop(config, directory, *arguments, **keywords):
         directory.config_file.parent.mkdir(exist_ok=True)
         directory.config_file.touch()  # so it has begun
@@ -242,14 +237,36 @@ def test_how_to_go_on_is_where_the_run_was_begun(tmp_path, monkeypatch, options,
     def interrupt(*_):
         raise InterruptError(signal.SIGTERM)
 
-    monkeypatch.setattr("service.cluster.ray_connection.connected", lambda address: nullcontext())
     monkeypatch.setattr("service.runs.train.train", stop)
-    monkeypatch.setattr("service.cli.study._on_ray", lambda *_: Place())
     monkeypatch.setattr(Study, "train", interrupt)
+
+
+@pytest.mark.parametrize(
+    ("options", "hint"),
+    [
+        ((), ""),
+        (("--publish",), ""),
+        (("--no-publish",), " --no-publish"),
+        (("--runtime", "ray", "--address", "head:6379", "--status", "off"), " --runtime ray --address head:6379"),
+    ],
+)
+@pytest.mark.parametrize("seeds", [(), ("--seeds", "0,1")])
+@pytest.mark.usefixtures("stopped_at_once")
+def test_how_to_go_on_is_as_the_run_was_begun(tmp_path, monkeypatch, options, hint, seeds):
+    monkeypatch.setattr("service.cluster.ray_connection.connected", lambda address: nullcontext())
+    monkeypatch.setattr("service.cli.study._on_ray", lambda *_: Place())
     result = tandem("pretrain", "--run-dir", tmp_path / "a run", "--registry", "registry", *seeds, *options)
     assert result.exit_code == 128 + signal.SIGTERM, result.exception
     how = f"continue with: tandem train --resume --run-dir '{tmp_path}/a run' --registry registry{hint}\n"
     assert result.stdout == f"stopped at once; {how}"
+
+
+@pytest.mark.usefixtures("stopped_at_once")
+def test_how_to_go_on_publishes_a_policy_of_a_task_only_if_that_was_typed(tmp_path):
+    asked = ("train", "push", "--registry", "registry", "--run-dir", tmp_path / "run")
+    for typed, said in (("--publish", " --publish"), ("--no-publish", "")):
+        result = tandem(*asked, typed)
+        assert result.stdout.endswith(f" --registry registry{said}\n"), result.output
 
 
 # --- what can be done with it ----------------------------------------------------------------------------------------
