@@ -37,7 +37,7 @@ PARTS: dict[int | str, dict[str, Any]] = {
     **problems((416, "The range lies beyond the file.")),
 }
 """Answers of a route that gives a file, in addition to 200."""
-_RANGE = re.compile(r"bytes=([0-9]{1,18})-")
+_RANGE = re.compile(r"([0-9]{1,20})-([0-9]{0,20})|-([0-9]{1,20})")
 _CONDITIONS = StaticFiles()
 """Only for its ``is_not_modified``."""
 
@@ -113,11 +113,12 @@ def file_response(
 ) -> Response:
     """Answer with the file, the requested range of it, or 304.
 
-    If-None-Match, If-Modified-Since, Range and If-Range count. ``etag`` has no quotation marks and is made from time
-    and size if None; ``cache`` is the header Cache-Control.
+    If-None-Match, If-Modified-Since, Range and If-Range count; a Range that is malformed or in another unit does not
+    (RFC 9110, section 14.2). ``etag`` has no quotation marks and is made from time and size if None; ``cache`` is the
+    header Cache-Control.
 
     Raises:
-        ProblemError: 416, the range lies beyond the file; 404, it cannot be read.
+        ProblemError: 416, a range lies beyond the file; 404, it cannot be read.
     """
     headers = {"cache-control": cache, **({"etag": f'"{etag}"'} if etag else {})}
     try:
@@ -127,8 +128,23 @@ def file_response(
     response = FileResponse(path, headers=headers, media_type=media_type, stat_result=status)
     if _CONDITIONS.is_not_modified(response.headers, request.headers):
         return NotModifiedResponse(response.headers)
-    begins = _RANGE.match(request.headers.get("range", ""))
-    if begins is not None and int(begins[1]) >= status.st_size and "if-range" not in request.headers:
-        beyond = {"Content-Range": f"bytes */{status.st_size}"}
-        raise ProblemError(416, "no-such-range", f"the file has {status.st_size} bytes", beyond)
+    begins = _begins(request.headers.get("range", ""), status.st_size)
+    beyond = max(begins, default=0) >= status.st_size
+    if begins and beyond and "if-range" not in request.headers:
+        length = {"Content-Range": f"bytes */{status.st_size}"}
+        raise ProblemError(416, "no-such-range", f"the file has {status.st_size} bytes", length)
+    if not begins or beyond:  # starlette would answer it with plain text
+        request.scope["headers"] = [each for each in request.scope["headers"] if each[0] != b"range"]
     return response
+
+
+def _begins(asked: str, num_bytes: int) -> list[int]:
+    """Where the ranges of a Range header begin; none where it is not well-formed, or has no bytes as its unit."""
+    unit, _, ranges = asked.partition("=")
+    begins = []
+    for text in ranges.split(","):
+        each = _RANGE.fullmatch(text.strip())
+        if unit.lower() != "bytes" or each is None or (each[2] and int(each[2]) < int(each[1])):
+            return []
+        begins.append(int(each[1]) if each[1] else max(0, num_bytes - int(each[3])))
+    return begins

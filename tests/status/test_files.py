@@ -29,11 +29,26 @@ def test_a_range(client, asked, start, end):
     assert answer.headers["content-range"] == f"bytes {start}-{end - 1}/{len(VIDEO)}"
 
 
-@pytest.mark.parametrize("asked", [f"bytes={len(VIDEO)}-", f"bytes={10**17}-{10**17}"])
+@pytest.mark.parametrize(
+    "asked",
+    [f"bytes={len(VIDEO)}-", f"bytes={10**17}-{10**17}", f"bytes={10**19}-", "bytes=-0", "bytes=0-1,99999-99999"],
+)
 def test_a_range_beyond_the_file(client, asked):
     answer = client.get(URL, headers={"Range": asked})
     assert (answer.status_code, answer.json()["type"]) == (416, "urn:tandem:no-such-range")
     assert answer.headers["content-range"] == f"bytes */{len(VIDEO)}"
+
+
+@pytest.mark.parametrize("asked", ["bytes=abc", "bytes=5-2", "items=0-1", "bytes", "bytes=", "bytes=0-1,x", "bytes=-"])
+def test_a_range_that_is_none_does_not_count(client, asked):
+    answer = client.get(URL, headers={"Range": asked})
+    assert (answer.status_code, answer.content) == (200, VIDEO)
+
+
+def test_several_ranges(client):
+    answer = client.get(URL, headers={"Range": "bytes=0-1, 500-501"})
+    assert answer.status_code == 206
+    assert answer.headers["content-type"].startswith("multipart/byteranges")
 
 
 def test_pictures_of_a_studys_run(tmp_path):
@@ -76,6 +91,8 @@ def test_a_range_of_a_file_that_changed_meanwhile(client, home):
     tag = client.get(URL).headers["etag"]
     ranged = {"Range": "bytes=5-9", "If-Range": tag}
     assert client.get(URL, headers=ranged).content == VIDEO[5:10]
+    beyond = client.get(URL, headers=ranged | {"Range": f"bytes={len(VIDEO)}-"})
+    assert (beyond.status_code, beyond.content) == (200, VIDEO)
     (home / "runs" / "old" / "rounds.mp4").write_bytes(VIDEO[::-1] + b"more")
     answer = client.get(URL, headers=ranged)
     assert (answer.status_code, answer.content) == (200, VIDEO[::-1] + b"more")
