@@ -12,6 +12,7 @@ from fastapi import routing
 
 from service.registry.registry import Registry
 from service.status import auth, server, stream
+from service.status.schemas import VersionSummary
 from service.status.stream import EVENT_SCHEMA
 from tests.status.conftest import serve
 from tests.status.runs import TOKEN, VIDEO, append, grid, publish, record, write_status
@@ -72,6 +73,11 @@ def test_every_kind_of_problem_is_listed():
     assert {"unknown-run", "no-such-range", "read-only", "damaged"} <= kinds
     table = TEXT[TEXT.index("## Errors") : TEXT.index("## The client")]
     assert {kind for kind in kinds if f"`{kind}`" not in table} == set()
+
+
+def test_the_version_that_is_shown_has_the_fields_of_one():
+    (shown,) = re.findall(r'"versions":\[\s(\{.*?\})\]\}', TEXT, re.DOTALL)
+    assert set(re.findall(r'"(\w+)":', shown)) == set(VersionSummary.model_fields)
 
 
 def test_every_event_is_listed():
