@@ -2,6 +2,7 @@
 
 import csv
 import shutil
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
@@ -151,6 +152,26 @@ def test_runs_are_found_sorted_and_compared(visit):
     page.get_by_label("Show long").uncheck()
     visit.wait("!document.querySelectorAll('.canvas')[0].data.some(trace => trace.name.startsWith('long'))")
     assert visit.complaints == []
+
+
+def test_many_runs_are_asked_for_in_questions_that_every_proxy_takes(visit):
+    ids = [f"night-{number:03d}-{'x' * 100}" for number in range(70)]
+    visit.asked.clear()
+    page = visit.go(f"#/compare/{','.join(ids)}").page
+    page.get_by_text(f"no run '{ids[-1]}'").wait_for()
+    questions = [url for url in visit.asked if "/v1/series?" in url]
+    assert max(map(len, questions)) < 6000
+    assert {id_ for url in questions for id_ in parse_qs(urlsplit(url).query)["runs"]} == set(ids)
+
+
+def test_what_is_wrong_with_a_question_is_said_where_runs_are_compared(visit):
+    page = visit.page
+    page.route("**/v1/series?*", lambda route: route.fulfill(status=414, body="<html>"))
+    visit.go("#/compare/cube,old")
+    page.get_by_text("the service answers 414").wait_for()
+    page.unroute("**/v1/series?*")
+    visit.points("bob/success_rate", 3)
+    assert page.get_by_text("the service answers 414").count() == 0
 
 
 def test_a_missing_value_is_a_gap_and_a_new_one_is_drawn(visit, home):

@@ -12,6 +12,8 @@ const MAX_POINTS = 1000;
 const MAX_NAMES = 60;
 /** Most runs that the service takes in one question. */
 const MAX_RUNS = 200;
+/** Characters that the runs of a question may take, and its metrics as many: nginx takes 8 KiB of URL. */
+const MAX_LENGTH = 2800;
 const AXES = [["env_steps", "env steps"], ["iteration", "iterations"], ["wall_s", "hours of learning"]];
 const HOUR_S = 3600;
 let boards = 0;
@@ -83,10 +85,8 @@ export class Board {
   async refresh() {
     const asked = ++this.asked;
     const names = [...new Set(this.shown().flatMap((panel) => panel.names))];
-    const parts = [];
-    for (let i = 0; i < names.length; i += MAX_NAMES) parts.push(names.slice(i, i + MAX_NAMES));
-    const chunks = [];
-    for (let i = 0; i < this.runs.length; i += MAX_RUNS) chunks.push(this.runs.slice(i, i + MAX_RUNS));
+    const parts = split("names", names, MAX_NAMES);
+    const chunks = split("runs", this.runs.map((run) => run.id), MAX_RUNS);
     const answers = await Promise.all(parts.flatMap((part) => chunks.map((runs) => this.ask(part, runs))));
     if (asked !== this.asked) return; // something else was asked for meanwhile
     this.data = new Map();
@@ -103,12 +103,12 @@ export class Board {
     await this.draw();
   }
 
+  /** Ask for some curves; names and runs are pairs of a query. */
   ask(names, runs) {
     const [start, end] = this.range ?? [null, null];
     const unit = this.axis === "wall_s" ? HOUR_S : 1;
     const bounds = this.range ? [["start", start * unit], ["end", end * unit]] : [];
-    const query = [...runs.map((run) => ["runs", run.id]), ...names.map((name) => ["names", name])];
-    return get(["v1", "series"], [...query, ["axis", this.axis], ["max_points", MAX_POINTS], ...bounds], this.signal);
+    return get(["v1", "series"], [...runs, ...names, ["axis", this.axis], ["max_points", MAX_POINTS], ...bounds], this.signal);
   }
 
   /** Take over what the answers say beside curves: names of metrics, and runs that cannot be read. */
@@ -210,4 +210,21 @@ export class Board {
     setText(this.trouble, error.message);
     this.trouble.hidden = false;
   }
+}
+
+/** Pairs of a query, of one key, in parts of ``most`` and of ``MAX_LENGTH`` characters at most. */
+function split(key, values, most) {
+  const parts = [];
+  let length = 0;
+  for (const value of values) {
+    const pair = [key, value];
+    const more = `${new URLSearchParams([pair])}&`.length;
+    length += more;
+    if (!parts.length || parts.at(-1).length === most || length > MAX_LENGTH) {
+      parts.push([]);
+      length = more;
+    }
+    parts.at(-1).push(pair);
+  }
+  return parts;
 }

@@ -29,7 +29,7 @@ export async function compareView(root, ids, signal) {
   show(statuses);
   compareConfigurations(setups.body, ids, signal);
   await every(EVERY_MS, signal, async () => {
-    await board.refresh();
+    await board.refresh().catch((error) => board.fail(error));
     const found = await get(["v1", "runs"], [["limit", 1000]], signal);
     show(new Map(found.runs.map((run) => [run.run_id, run])));
   });
