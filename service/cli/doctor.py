@@ -28,9 +28,9 @@ def doctor(as_json: JsonOption = False) -> None:
     """Tell what this machine has for Tandem: versions, cores, OpenGL, memory, disk; and what is missing."""
     import torch
 
-    missing = [extra for extra, package in _EXTRAS.items() if importlib.util.find_spec(package) is None]
     threads = os.cpu_count() or 1
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else threads
+    missing = [extra for extra, package in _EXTRAS.items() if importlib.util.find_spec(package) is None]
     memory_gb, disk_gb = _free_memory_gb(), shutil.disk_usage(Path.cwd()).free / 1e9
     rows = [
         ("tandem", f"{__version__}, commit {(git_commit() or 'unknown')[:12]}", ""),
@@ -41,8 +41,7 @@ def doctor(as_json: JsonOption = False) -> None:
         ("extras", ", ".join(extra for extra in _EXTRAS if extra not in missing) or "none",
          f"for more: pip install 'tandem-skills[{','.join(missing)}]'" if missing else ""),
         ("system", platform.platform(), "" if platform.system() == "Linux" else "only Linux is tested"),
-        ("cores", f"{usable} of {threads}",
-         f"a run would start {threads} threads: --set run.num_threads={usable}" if usable < threads else ""),
+        ("cores", f"{usable} of {threads}", ""),
         ("free memory", f"{memory_gb:.1f} GB" if memory_gb < float("inf") else "unknown",
          "a run takes about 1 GB: end other programs" if memory_gb < _LEAST_GB else ""),
         ("free disk here", f"{disk_gb:.1f} GB", "a run takes up to 1 GB" if disk_gb < _LEAST_GB else ""),

@@ -29,6 +29,8 @@ _LIMITS = {
     "object_offset_m": (0.0, 0.1),
 }
 """Within which a range has to be, by its name."""
+_LOWEST = {"table_height_m": 0.0, "object_size": 1.0}
+"""What the lowest place of an object depends on, and what it is without a range."""
 
 
 class WorkspaceConfig(FrozenModel):
@@ -197,6 +199,13 @@ class WorldConfig(FrozenModel):
             )
         if self.observed.obstacles and not self.obstacles:
             raise ValueError("observed.obstacles, and no obstacles: describe some, or leave it out")
+        ranges = self.randomisation.model_ranges
+        lowest_m, smallest = (ranges.get(name, (usual,))[0] for name, usual in _LOWEST.items())
+        if lowest_m + smallest * min(self.rest_heights_m) < 0.0:
+            raise ValueError(
+                f"randomisation.table_height_m begins at {lowest_m:g}: the centre of an object would lie below z = 0, "
+                "where the workspace begins; let it begin higher"
+            )
         if (highest_m := max(self.rest_heights_m)) >= self.workspace.height_m:
             raise ValueError(
                 f"the object's centre lies {highest_m:g} m high, and the workspace ends at "

@@ -72,7 +72,8 @@ class WorldBatch:
         log = mujoco.MjLogConfig.get()  # MuJoCo's own log is a file in the working directory
         log.logto_file = log.logto_console = False
         log.set()
-        num_threads = min(num_threads or os.cpu_count() or 1, num_worlds)
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        num_threads = min(num_threads or cores, num_worlds)
         self._pool = rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._data = [mujoco.MjData(self.model) for _ in range(max(num_threads, 1))]
         self.layout = build_layout(config, blocked_fraction=blocked_fraction)

@@ -108,6 +108,10 @@ def _compile(config: WorldConfig, drawn: dict[str, float]) -> mujoco.MjModel:
             model.geom_pos[geom, 2] += height_m
         elif model.body_mocapid[body] < 0 and geom == model.body_geomadr[body]:  # once for a body of several geoms
             model.body_pos[body, 2] += height_m
+    # The world's own geoms have all moved, and so must the tree of bounds that MuJoCo finds them by: else what has
+    # several geoms, as a finger has, is sought at the old height, and sinks into a raised table.
+    first, num = model.body_bvhadr[0], model.body_bvhnum[0]
+    model.bvh_aabb[first : first + num, 2] += height_m
     return model
 
 

@@ -43,5 +43,5 @@ def test_it_says_what_to_do(monkeypatch):
     assert rows["OpenGL"] == ("no", "cannot draw: install an OpenGL")
     assert rows["free memory"] == ("0.5 GB", "a run takes about 1 GB: end other programs")
     assert rows["free disk here"] == ("1.0 GB", "a run takes up to 1 GB")
-    assert rows["cores"] == ("2 of 64", "a run would start 64 threads: --set run.num_threads=2")
+    assert rows["cores"] == ("2 of 64", "")
     assert rows["extras"][1] == "for more: pip install 'tandem-skills[cluster]'"

@@ -67,6 +67,26 @@ def test_a_bank_covers_each_range_evenly_and_its_models_are_as_drawn():
         assert bank.rest_height_m[index] == pytest.approx(rest_m)
 
 
+def test_fingers_do_not_sink_into_a_raised_table():
+    """A finger has several geoms, which MuJoCo seeks by the tree of bounds of the table."""
+    with WorldBatch(world(num_models=1, table_height_m=[0.03, 0.03]), 1, num_threads=1) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        worlds.put_objects(np.array([[0.1, 0.15, 0.055]]), slice(0, 1))
+        for _ in range(25):
+            worlds.step(np.float32([[0, 0, -1, 0]]))
+        model = worlds.bank.models[0]
+        data = mujoco.MjData(model)
+        mujoco.mj_setState(model, data, worlds.states[0, worlds.layout.physics], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        mujoco.mj_forward(model, data)
+        table = model.geom("table").id
+        touching = [contact.dist for contact in data.contact[: data.ncon] if table in contact.geom]
+        fingers = [geom for geom in range(model.ngeom) if "finger" in model.body(model.geom_bodyid[geom]).name]
+        reach = (abs(data.geom_xmat[geom].reshape(3, 3)[2]) @ model.geom_aabb[geom, 3:] for geom in fingers)
+        lowest_m = min(data.geom_xpos[geom, 2] - down for geom, down in zip(fingers, reach, strict=True))
+        assert len(touching) > 0
+        assert lowest_m > 0.027
+
+
 @pytest.mark.parametrize("fixture", ["wall", "box"])
 def test_what_stands_on_the_table_goes_up_with_it(fixture):
     config = world(num_models=1, table_height_m=[0.02, 0.02]).model_copy(update={"fixture": fixture})
