@@ -38,7 +38,7 @@ TESTS = Path(__file__).parent
 SLOW = (
     "cluster", "status/test_page.py", "benchmarks", "runs/test_study.py", "test_benchmarks.py", "media",
     "methods/test_task.py", "status/test_page_curves.py", "status/test_downstream.py", "runs/test_signals.py",
-    "envs/test_world.py", "test_package.py", "robot/play/test_server.py", "runs/test_reporting.py",
+    "envs/test_world.py", "test_package.py", "test_notebooks.py", "robot/play/test_server.py", "runs/test_reporting.py",
     "methods/test_skill_learning.py", "runs/test_killed.py", "runs/test_pretrain.py", "export", "cli/test_main.py",
     "status/test_nginx.py", "status/test_stream.py", "status/test_connections.py", "cli/test_tasks.py",
     "status/test_openapi.py", "methods/test_skill_run.py", "test_docs_site.py", "cli/test_attacks.py",

@@ -113,6 +113,9 @@ def _missing(group: Sequence[Experiment]) -> str:
 def _from_to(before: Seeds, after: Seeds) -> str:
     seeds = {each[TRIAL]["seed"] for each in after}
     alike = [each for each in before if each[TRIAL]["seed"] in seeds]
+    if alike:
+        known = {each[TRIAL]["seed"] for each in alike}
+        after = [each for each in after if each[TRIAL]["seed"] in known]
     return f"{_mean(alike)} to {_mean(after)} ({len(after)})" if after else ""
 
 

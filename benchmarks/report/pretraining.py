@@ -87,7 +87,7 @@ def seeds_block(study: Mapping[str, Any]) -> str:
         found = {row["asked"]: row for row in run["measured"]}
         cells = [", ".join(f"{100 * found[a][kind]['last']:.1f}" for kind in KINDS) if a in found else "" for a in at]
         lifts = [point["lifted"] for point in run["curve"][-NUM_LAST:]]
-        rows.append((str(run["seed"]), *cells, str(num_dips(run["curve"])), percent(fmean(lifts))))
+        rows.append((str(run["seed"]), *cells, dips(run["curve"]), percent(fmean(lifts))))
     words = f"At least {percent(ASKED_RATES['mixed'])} of mixed goals: {_how_many(study)} env steps."
     return f"{table(head, rows)}\n\n{words}"
 
@@ -160,10 +160,13 @@ def _evaluated(rate: float) -> dict[str, Any]:
     return {"evaluation": {"success_last": rate, "num_episodes": NUM_EPISODES}}
 
 
-def num_dips(curve: Sequence[Mapping[str, float]]) -> int:
-    """Evaluations of mixed goals after ``DIPS_FROM`` that are below what is asked for, as the one before them."""
-    rates = [row["mixed"] for row in curve if row["env_steps"] >= DIPS_FROM]
-    return sum(max(pair) < ASKED_RATES["mixed"] for pair in pairwise(rates))
+def dips(curve: Sequence[Mapping[str, float]]) -> str:
+    """How many evaluations of mixed goals after ``DIPS_FROM`` are below what is asked for, as the one before them.
+
+    Such as ``1 of 15``; empty where there were none that could be.
+    """
+    pairs = list(pairwise(row["mixed"] for row in curve if row["env_steps"] >= DIPS_FROM))
+    return f"{sum(max(pair) < ASKED_RATES['mixed'] for pair in pairs)} of {len(pairs)}" if pairs else ""
 
 
 def training_table(runs: Sequence[Run]) -> str:

@@ -69,19 +69,21 @@ class Rate(NamedTuple):
 def rate_of(results: Sequence[Mapping[str, Any]], key: str = "success_last") -> Rate:
     """The mean over one or more seeds.
 
-    The interval of several is for the mean over seeds (Student's t). That of one is Wilson's over its episodes: it
-    says how far the share may be off because episodes were few, not how far another seed would differ.
+    The interval of several is for the mean over seeds (Student's t), and no narrower than Wilson's over all their
+    episodes: seeds that are equal by chance would have none. That of one is Wilson's: it says how far the share may be
+    off because episodes were few, not how far another seed would differ.
 
     Args:
         results: of one method on one task, a seed each, as ``result.json`` has them.
         key: of ``evaluation``.
     """
     evaluations = [result["evaluation"] for result in results]
-    rates = [float(each[key]) for each in evaluations]
-    if len(rates) == 1:
-        num = evaluations[0]["num_episodes"]
-        return Rate(rates[0], *wilson_interval(round(rates[0] * num), num), 1)
-    return Rate(float(np.mean(rates)), *seed_interval(rates), len(rates))
+    rates, num = [float(each[key]) for each in evaluations], sum(each["num_episodes"] for each in evaluations)
+    mean = float(np.mean(rates))
+    low, high = wilson_interval(round(mean * num), num)
+    if len(rates) > 1:
+        low, high = min(low, seed_interval(rates)[0]), max(high, seed_interval(rates)[1])
+    return Rate(mean, low, high, len(rates))
 
 
 def seed_interval(rates: Sequence[float]) -> tuple[float, float]:

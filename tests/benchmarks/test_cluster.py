@@ -17,8 +17,6 @@ from tests.runs.runs import tiny_config
 from tools import faults
 from tools.rollout_audit import Stretch, audit_rollouts, stretches_of
 
-WHERE = {"cpu": "Xeon", "num_cpus": 2, "git_commit": "abcdef0123", "time": "2026-11-21T12:00:00+00:00"}
-
 
 def moment(at):
     return datetime.fromtimestamp(at, UTC)

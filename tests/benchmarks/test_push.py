@@ -11,13 +11,11 @@ from service.policies.numpy_policy import numpy_bob
 from service.registry.loading import Trained, parameters_digest
 
 
-def two_primitives(*bias):
-    """Primitives that do the same wherever the object is: nothing, or what their biases say."""
+def two_primitives():
+    """Primitives that do nothing, wherever the object is."""
     parameters = dict(Learner(load_config(None, ["policy.bob.num_primitives=2"])).weights().bob)
     for name in ("primitives.output_weight", "primitives.output_bias"):
         parameters[name] = np.zeros_like(parameters[name])
-    for place in bias:
-        parameters["primitives.output_bias"][place] = 3.0
     return Trained("by hand", "primitives", load_config(), numpy_bob(parameters), parameters)
 
 

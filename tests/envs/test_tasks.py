@@ -27,7 +27,7 @@ from tests.envs.scripted_tasks import play_task
 
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
 DOCS = Path(__file__).parents[2] / "docs"
-RECORDED, DECISION = DOCS / "results" / "scripted_tasks.json", DOCS / "decisions" / "0007-the-downstream-tasks.md"
+RECORDED = DOCS / "results" / "scripted_tasks.json"
 TASKS = {name: find_task(name) for name in PAPERS}
 HARD_TASKS = {name: find_task(name) for name in NAMES if name not in PAPERS}
 CENTER = np.array([-0.05, 0.0])

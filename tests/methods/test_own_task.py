@@ -6,6 +6,7 @@ import pytest
 from service.base.errors import TandemError
 from service.config import load_config
 from service.envs.tasks import find_task
+from service.methods import task_check
 from service.methods.task_check import check_task
 from service.registry.loading import load
 from service.registry.publishing import publish
@@ -135,7 +136,8 @@ def test_what_is_wrong_is_said_before_anything_is_learned(file, tmp_path, caplog
         assert_one_line(error.value, said)
 
 
-def test_the_examples_of_the_docs_run():
+def test_the_examples_of_the_docs_run(monkeypatch):
+    monkeypatch.setattr(task_check, "_NUM_WORLDS", 8)
     for name in ("lift_and_hold", "push_along_a_line"):
         task = find_task(f"docs/examples/{name}.py")
         check_task(task, load_config(None, []).world, relabels=name == "lift_and_hold")

@@ -6,6 +6,9 @@ from service.methods.task_evaluation import rate_of, seed_interval
 def test_rates_by_hand():
     seeds = [{"evaluation": {"num_episodes": 100, "success_last": rate}} for rate in (0.84, 0.80, 0.82, 0.96)]
     assert str(rate_of(seeds[:3])) == "82.0 % [77, 87] (3)"  # 0.82 +- 4.303 * 0.02 / sqrt(3)
+    # Wilson, 2991 of 3000: seeds that are equal by chance are not known exactly
+    equal = [{"evaluation": {"success_last": 0.997, "num_episodes": 1000}}] * 3
+    assert (rate_of(equal).low, rate_of(equal).high) == pytest.approx((0.9943, 0.9984), abs=1e-4)
     assert str(rate_of(seeds[3:])) == "96.0 % [90, 98]* (1)"  # 96 of 100, Wilson (z = 1.96) is 0.902 to 0.984
 
 
