@@ -172,12 +172,11 @@ class Bridge:
             safe.wait_until(tick_s + self._tick_s)
 
     def _settle(self, now_s: float) -> None:
-        """Bring the set-point to rest with the gripper as wide as it is."""
-        width_m = float(self.safe.state.fingers_m.sum())
+        """Bring the set-point to rest."""
         safety = self._config.safety
         most_s = safety.max_speed_m_s / safety.max_acceleration_m_s2 + _MORE_SETTLE_S
         for tick in range(1, math.ceil(most_s / self._tick_s)):
-            self.safe.brake(width_m)
+            self.safe.brake()
             if self.safe.limiter.is_still:
                 return
             self.safe.wait_until(now_s + tick * self._tick_s)

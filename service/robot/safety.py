@@ -92,7 +92,7 @@ class SafeRobot:
         self.stopped: str | None = None
         """Why the robot was stopped; None while it was not."""
         self.width_m = np.nan
-        """Opening that was commanded last."""
+        """Opening that was commanded last; at the start as it is."""
         self._expected_s = np.inf
         self._moved_s = np.nan
 
@@ -125,6 +125,7 @@ class SafeRobot:
                 f"the gripper starts at ({in_metres(self.state.effector_m)}) m, outside the box {self.limiter.box}"
             )
         self.limiter.start(self.state.effector_m)
+        self.width_m = float(self.state.fingers_m.sum())
         self._expected_s = self._robot.now_s()
         self._moved_s = self._expected_s - tick_s
 
@@ -194,9 +195,12 @@ class SafeRobot:
         if not np.isfinite(numbers).all():
             self._fail(f"{what} is not finite: {', '.join(f'{number:g}' for number in numbers)}")
 
-    def brake(self, width_m: float) -> None:
-        """Send the next set-point on the way to rest; errors are those of ``move``."""
-        self._send(self.limiter.brake, width_m)
+    def brake(self) -> None:
+        """Send the next set-point on the way to rest; errors are those of ``move``.
+
+        The gripper's width stays as it was commanded: fingers that are sent to where they are press with nothing.
+        """
+        self._send(self.limiter.brake, self.width_m)
 
     def _send(self, advance: Callable[[float], StateArray], width_m: float) -> None:
         self._check_stopped()

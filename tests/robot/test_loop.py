@@ -80,6 +80,15 @@ def test_steps_are_40_ms_and_end_at_rest():
     assert len(robot.commands) > 12  # it braked
 
 
+def test_what_is_held_stays_held_while_it_comes_to_rest():
+    """Fingers that are sent to where they are press with nothing."""
+    robot = FakeRobot()
+    robot.fingers_m = np.array([0.025, 0.025])  # on an object, which keeps them apart
+    Bridge(Steady([1.0, 0.0, 0.0, -1.0]), robot, robot.poses, WorldConfig(), BridgeConfig()).run(GOAL_M, 3)
+    assert len(robot.commands) > 3 * 10  # it braked
+    assert {command.width_m for _, command in robot.commands} == {0.0}
+
+
 def test_it_comes_to_rest_however_slowly_it_may_brake():
     slow = BridgeConfig(set_points_per_step=4, safety={"max_acceleration_m_s2": 0.05})
     robot, policy = FakeRobot(), Steady([-1.0, 0.0, 0.0, 0.0])
