@@ -158,7 +158,7 @@ class Hand:
     """A Franka hand that follows a wanted width, by single motions in a thread of its own.
 
     To close is to grasp: the fingers go to the wanted width and press where something is in the way. What is held stays
-    held until a greater width is wanted.
+    held until a width is wanted that is greater than its own.
     """
 
     def __init__(self, gripper: Any, parameters: FrankaParameters) -> None:
@@ -206,8 +206,9 @@ class Hand:
         if self._is_moving() and time.monotonic() - self._sent_s > _MOST_MOTION_S:
             raise TimeoutError(f"a motion has not ended within {_MOST_MOTION_S:g} s")
         width_m, force_n = wanted
-        change_m = width_m - self._sent_m
-        if abs(change_m) < self._parameters.hand_tolerance_m or (change_m < 0.0 and state.is_grasped):
+        change_m, tolerance_m = width_m - self._sent_m, self._parameters.hand_tolerance_m
+        # What was sent is narrower than what is held: a width in between is no reason to let go.
+        if abs(change_m) < tolerance_m or (state.is_grasped and width_m <= self.width_m + tolerance_m):
             return
         self._end_motion()
         self._sent_m, self._sent_s, speed = width_m, time.monotonic(), self._parameters.hand_speed_m_s

@@ -191,6 +191,16 @@ def test_the_hand_grasps_to_close_moves_to_open_and_keeps_what_it_holds(hand, gr
     assert gripper.told[-1] == ("move", 0.07)
 
 
+def test_the_hand_lets_go_only_for_a_width_greater_than_that_of_what_it_holds(hand, gripper):
+    hand.go_to(0.0, 20.0)
+    hand.advance()
+    gripper.width, gripper.is_grasped = 0.05, True
+    for width in (0.03, 0.05, 0.053, 0.06):
+        hand.go_to(width, 20.0)
+        hand.advance()
+    assert gripper.told == [("grasp", 0.0, 20.0), ("move", 0.06)]
+
+
 def test_the_hand_ends_a_motion_before_the_next_and_when_it_is_halted(hand, gripper):
     gripper.ends = False
     for width in (0.0, 0.08):
