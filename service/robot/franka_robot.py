@@ -26,7 +26,7 @@ from service.robot.backends import Backend
 from service.robot.interface import Command, ObjectPose, PoseSource, RobotState
 
 _DOWN = (1.0, 0.0, 0.0, 0.0)  # x y z w
-_MOST_TILT_RAD = 0.2
+_MOST_TURN_RAD = 0.2
 _HAND_PERIOD_S = 0.02
 _JOIN_S = 2.0
 _STOP_S = 0.5
@@ -60,7 +60,7 @@ class FrankaRobot:
         parameters: where, and how.
 
     Raises:
-        RobotError: it does not answer, has errors, or its gripper does not point down.
+        RobotError: it does not answer, has errors, or its gripper does not point down or is turned.
     """
 
     def __init__(self, franky: Any, parameters: FrankaParameters) -> None:
@@ -74,9 +74,11 @@ class FrankaRobot:
             if self._robot.has_errors:
                 raise RobotError(self._words("it has errors: look at Desk, mend their cause, and unlock it again"))
             self._robot.set_collision_behavior(parameters.max_contact_torque_nm, parameters.max_contact_force_n)
-            tilt_rad = float(np.arccos(np.clip(-self._pose().matrix[2, 2], -1.0, 1.0)))
-            if tilt_rad > _MOST_TILT_RAD:
-                raise RobotError(self._words(f"its gripper is {tilt_rad:.1f} rad off pointing down: guide it there"))
+            # In any direction: one that is turned about the vertical would be turned back by the first command.
+            turn_rad = 2.0 * float(np.arccos(min(abs(np.ravel(self._pose().quaternion) @ _DOWN), 1.0)))
+            if not turn_rad <= _MOST_TURN_RAD:
+                where = "pointing down with its left finger on the side of negative y"
+                raise RobotError(self._words(f"its gripper is {turn_rad:.1f} rad off {where}: guide it there"))
             self._hand = Hand(franky.Gripper(parameters.host), parameters)
 
     def now_s(self) -> float:

@@ -25,9 +25,6 @@ class Affine:
         assert np.shape(translation) == (3,)
         assert np.shape(quaternion) == (4,)
         self.translation, self.quaternion = np.asarray(translation), np.asarray(quaternion)
-        x, y = self.quaternion[:2]
-        self.matrix = np.eye(4)
-        self.matrix[2, 2] = 1.0 - 2.0 * (x * x + y * y)
 
 
 class Future:
@@ -67,9 +64,9 @@ class Franky:
     Affine = Affine
     RealtimeConfig = SimpleNamespace(Enforce="enforce", Ignore="ignore")
 
-    def __init__(self, down=True):
+    def __init__(self, quaternion=(1.0, 0.0, 0.0, 0.0)):
         self.targets, self.motions, self.gripper = [], [], Gripper()
-        pose = Affine(TIP_IN_BASE, [1.0, 0.0, 0.0, 0.0] if down else [0.7071, 0.0, 0.0, 0.7071])
+        pose = Affine(TIP_IN_BASE, quaternion)
         self.robot = SimpleNamespace(
             has_errors=False,
             current_pose=SimpleNamespace(end_effector_pose=pose),
@@ -144,6 +141,10 @@ def test_stop_ends_the_control_once_and_for_all(robot, franky):
         robot.command(Command(np.zeros(3), 0.08))
 
 
+def test_a_gripper_that_nearly_points_down_is_taken_however_its_quaternion_is_signed():
+    FrankaRobot(Franky((-0.998, 0.05, 0.03, -0.02)), PARAMETERS).close()
+
+
 def test_a_reflex_shows_as_no_longer_connected_and_an_error_as_one_line(robot, franky):
     robot.command(Command(np.zeros(3), 0.08))
     franky.tracker.is_running = False
@@ -155,9 +156,17 @@ def test_a_reflex_shows_as_no_longer_connected_and_an_error_as_one_line(robot, f
         robot.read()
 
 
-@pytest.mark.parametrize(("errors", "down", "message"), [(True, True, "unlock"), (False, False, "1.6 rad off")])
-def test_a_robot_that_is_not_ready_is_refused_before_anything_moves(errors, down, message):
-    franky = Franky(down)
+@pytest.mark.parametrize(
+    ("errors", "quaternion", "message"),
+    [
+        (True, (1.0, 0.0, 0.0, 0.0), "unlock"),
+        (False, (0.7071, 0.0, 0.0, 0.7071), "1.6 rad off pointing down"),
+        (False, (0.7071, 0.7071, 0.0, 0.0), "1.6 rad off .* left finger on the side of negative y"),  # down, but turned
+        (False, (0.0, 1.0, 0.0, 0.0), "3.1 rad off"),  # left is right
+    ],
+)
+def test_a_robot_that_is_not_ready_is_refused_before_anything_moves(errors, quaternion, message):
+    franky = Franky(quaternion)
     franky.robot.has_errors = errors
     with pytest.raises(RobotError, match=message):
         FrankaRobot(franky, PARAMETERS)
