@@ -32,6 +32,8 @@ _JOIN_S = 2.0
 _STOP_S = 0.5
 _MOST_MOTION_S = 3.0
 """All the way at half the greatest speed takes 1.6 s."""
+_MOST_SILENT_S = 1.0
+"""Of the hand. While it ends a motion nothing is measured, and that may take until the motion is over, 0.8 s."""
 
 
 class FrankaParameters(FrozenModel):
@@ -88,8 +90,11 @@ class FrankaRobot:
     def read(self) -> RobotState:
         """Measure the arm; the hand as its thread saw it last.
 
+        The time is the arm's: by that of the hand, which measures nothing while it ends a motion, every such motion
+        would stop the arm.
+
         Raises:
-            RobotError: no answer.
+            RobotError: no answer, or none of the hand for longer than it needs to end a motion.
         """
         with self._saying("read"):
             tip = np.array(self._pose().translation).reshape(3) + self._base
@@ -97,6 +102,8 @@ class FrankaRobot:
             connected = in_control and not self._robot.has_errors
         if self._hand.fault is not None:
             raise RobotError(self._words(f"hand: {self._hand.fault}"))
+        if (silent_s := self.now_s() - self._hand.time_s) > _MOST_SILENT_S:
+            raise RobotError(self._words(f"hand: no answer for {silent_s:.1f} s"))
         return RobotState(self.now_s(), tip, np.full(2, self._hand.width_m / 2), connected)
 
     def command(self, command: Command) -> None:
@@ -165,8 +172,8 @@ class Hand:
 
     def __init__(self, gripper: Any, parameters: FrankaParameters) -> None:
         self._gripper, self._parameters = gripper, parameters
-        self.width_m = float(gripper.width)
-        """Last measured."""
+        self.width_m, self.time_s = float(gripper.width), time.monotonic()
+        """Last measured, and when."""
         self.fault: str | None = None
         """Why it moves no longer."""
         self._wanted: tuple[float, float] | None = None  # width and force; None: to stand still
@@ -200,7 +207,7 @@ class Hand:
     def advance(self) -> None:
         """Measure, and send the next motion where one is due."""
         state = self._gripper.state
-        self.width_m = float(state.width)
+        self.width_m, self.time_s = float(state.width), time.monotonic()
         wanted = self._wanted
         if wanted is None:
             self._end_motion()

@@ -236,6 +236,17 @@ def test_a_hand_that_does_not_end_its_motion_stops_the_robot(robot, franky, monk
     until(fails)
 
 
+def test_a_hand_that_is_silent_for_longer_than_a_motion_takes_stops_the_robot(robot, monkeypatch):
+    robot._hand.close()  # as if its thread hung in the library
+    measured_s = robot._hand.time_s
+    assert 0.0 <= robot.now_s() - measured_s < 5.0
+    monkeypatch.setattr(robot, "now_s", lambda: measured_s + 0.9)
+    assert robot.read().time_s == measured_s + 0.9
+    monkeypatch.setattr(robot, "now_s", lambda: measured_s + 1.1)
+    with pytest.raises(RobotError, match=r"franka at robot\.local: hand: no answer for 1\.1 s"):
+        robot.read()
+
+
 class Camera:
     def __init__(self, place):
         self._place = place
