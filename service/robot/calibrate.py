@@ -119,7 +119,7 @@ def measure_response(
 ) -> tuple[_Shares, float]:
     """Move along each axis, there and back; ``covered_share`` and ``delay_steps`` of a ``Calibration``."""
     rows: list[dict[str, Any]] = []
-    box = config.safety.box(world.workspace)
+    box = config.safety.box(world)
     motions = _Motions((box.lower_m + box.upper_m) / 2)
     bridge = Bridge(motions, robot, None, world, config, held=held, record=rows.append)
     bridge.run(np.zeros(3), motions.num_steps)

@@ -89,8 +89,7 @@ class Bridge:
         self._blocked = world.gripper == "blocked"
         self._step_s = world.physics_step_s * world.num_substeps
         self._tick_s = self._step_s / config.set_points_per_step
-        box = config.safety.box(world.workspace)
-        self.safe = SafeRobot(robot, poses, config.safety, box, held=held, dry_run=dry_run)
+        self.safe = SafeRobot(robot, poses, config.safety, world, held=held, dry_run=dry_run)
         """The only way to the robot."""
 
     def run(self, goal_m: StateArray, num_steps: int) -> float:

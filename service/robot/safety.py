@@ -12,7 +12,8 @@ from pydantic import Field
 from service.base.errors import ConfigError, RobotError, SafetyStopError, in_metres
 from service.base.types import StateArray
 from service.config.frozen import FrozenModel
-from service.config.world import Point, WorkspaceConfig
+from service.config.world import Point, WorldConfig
+from service.envs.robot import described
 from service.robot.interface import Command, PoseSource, RobotInterface, RobotState
 from service.robot.limits import Box, SetPointLimiter
 from service.robot.watchdogs import PoseWatch, StateWatch, WatchConfig
@@ -30,13 +31,15 @@ class SafetyConfig(FrozenModel):
     )
     upper_m: Point | None = Field(None, description="the other corner; None: of the workspace, with the margin")
     margin_m: float = Field(0.05, ge=0.0, le=0.3, description="of the box around the workspace, to the sides and up")
-    lowest_m: float = Field(0.012, ge=0.0, le=0.5, description="least height of a set-point above the table")
+    lowest_m: float | None = Field(
+        None, ge=0.0, le=0.5, description="least height of a set-point above the table; None: of the policy's robot"
+    )
     max_speed_m_s: float = Field(1.7, gt=0.0, le=1e6, description="of the set-point")
     max_acceleration_m_s2: float = Field(
         11.0, gt=0.0, le=1e6, description="of the set-point; an arm that follows goes beyond by up to a seventh"
     )
     min_width_m: float = Field(0.0, ge=0.0, le=0.5, description="of the gripper")
-    max_width_m: float = Field(0.08, ge=0.0, le=0.5)
+    max_width_m: float | None = Field(None, ge=0.0, le=0.5, description="None: the opening of the policy's robot")
     max_grip_force_n: float = Field(40.0, gt=0.0, le=200.0)
     max_tracking_error_m: float = Field(
         0.15, gt=0.0, le=1.0, description="an arm further than this from its set-point is stuck, or not ours"
@@ -44,20 +47,24 @@ class SafetyConfig(FrozenModel):
     max_late_s: float = Field(0.03, gt=0.0, le=0.05, description="a control step or set-point later than this")
     watch: WatchConfig = WatchConfig()
 
-    def box(self, workspace: WorkspaceConfig) -> Box:
-        """The box of set-points of a policy with a workspace.
+    def box(self, world: WorldConfig) -> Box:
+        """The box of set-points of a policy of a world.
 
         Raises:
             ConfigError: the corners are the wrong way round, or nothing is left above ``lowest_m``.
         """
-        margin = np.full(3, self.margin_m)
+        workspace, margin = world.workspace, np.full(3, self.margin_m)
         lower = np.array(workspace.lower_m) - margin if self.lower_m is None else np.array(self.lower_m)
         upper = np.array(workspace.upper_m) + margin if self.upper_m is None else np.array(self.upper_m)
-        lower[2] = max(lower[2], self.lowest_m)
+        lower[2] = max(lower[2], described(world).lowest_m if self.lowest_m is None else self.lowest_m)
         box = Box(lower, upper)
         if (lower >= upper).any():
             raise ConfigError(f"safety: the box {box} is empty: raise upper_m, or lower lower_m or lowest_m")
         return box
+
+    def widest_m(self, world: WorldConfig) -> float:
+        """Greatest opening that is commanded for a policy of a world."""
+        return described(world).opening_m if self.max_width_m is None else self.max_width_m
 
 
 def always_held() -> bool:
@@ -72,9 +79,12 @@ class SafeRobot:
         robot: what moves.
         poses: what sees the object; None where nothing has to.
         config: bounds.
-        box: of set-points.
+        world: of the policy, whose workspace and robot say what the bounds leave open.
         held: the dead-man's switch: whether it is held now; asked at every tick, and returns at once.
         dry_run: command nothing.
+
+    Raises:
+        ConfigError: an empty box.
     """
 
     def __init__(
@@ -82,13 +92,14 @@ class SafeRobot:
         robot: RobotInterface,
         poses: PoseSource | None,
         config: SafetyConfig,
-        box: Box,
+        world: WorldConfig,
         *,
         held: Callable[[], bool] = always_held,
         dry_run: bool = False,
     ) -> None:
         self.config, self._robot, self._poses, self._held, self._dry_run = config, robot, poses, held, dry_run
-        self.limiter = SetPointLimiter(box, config.max_speed_m_s, config.max_acceleration_m_s2)
+        self.limiter = SetPointLimiter(config.box(world), config.max_speed_m_s, config.max_acceleration_m_s2)
+        self._widest_m = config.widest_m(world)
         self.stopped: str | None = None
         """Why the robot was stopped; None while it was not."""
         self.width_m = np.nan
@@ -208,7 +219,7 @@ class SafeRobot:
             now_s = self._robot.now_s()
             set_point = advance(now_s - self._moved_s)
             self._moved_s = now_s
-            self.width_m = float(np.clip(width_m, self.config.min_width_m, self.config.max_width_m))
+            self.width_m = float(np.clip(width_m, self.config.min_width_m, self._widest_m))
             if not self._dry_run:
                 self._robot.command(Command(set_point.copy(), self.width_m, self.config.max_grip_force_n))
         except RobotError as error:

@@ -49,7 +49,7 @@ def test_the_champion_reaches_goals_within_the_bounds_of_a_franka(champion):
         robot.reset(np.array([0.0, 0.05, 0.025]))
         assert bridge.run(goal, 50) < 0.05
     assert robot.now_s() >= 2.0
-    tip, box = np.concatenate([row["measured_m"] for row in rows]), SMOOTH.safety.box(world.workspace)
+    tip, box = np.concatenate([row["measured_m"] for row in rows]), SMOOTH.safety.box(world)
     assert ((tip > box.lower_m - 0.01) & (tip < box.upper_m + 0.01)).all()
     assert tip[:, 2].min() < 0.03  # it went down to the object
 

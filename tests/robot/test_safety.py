@@ -5,6 +5,7 @@ import pytest
 
 from service.base.errors import ConfigError, RobotError
 from service.config import WorldConfig
+from service.envs.panda import PANDA
 from service.robot.disturbed import DisturbanceConfig, DisturbedPoses, DisturbedRobot
 from service.robot.loop import Bridge, BridgeConfig
 from service.robot.safety import SafeRobot, SafetyConfig
@@ -12,7 +13,7 @@ from tests.robot.fakes import HOME_M, OBJECT_M, FakeRobot, Steady
 
 WORLD = WorldConfig()
 CONFIG = BridgeConfig(set_points_per_step=5)
-BOX = CONFIG.safety.box(WORLD.workspace)
+BOX = CONFIG.safety.box(WORLD)
 FAULTS = {
     "read fails": "no answer",
     "command fails": "refused",
@@ -164,7 +165,7 @@ def test_what_is_wrong_before_the_start_moves_nothing():
 
 def test_a_jump_is_passed_over_and_the_pose_before_it_stands_in():
     robot = FakeRobot()
-    safe = SafeRobot(robot, robot.poses, CONFIG.safety, BOX)
+    safe = SafeRobot(robot, robot.poses, CONFIG.safety, WORLD)
     safe.start(0.004)
     robot.fault, robot.fault_s = "jumping pose", robot.time_s
     for _ in range(3):
@@ -208,7 +209,21 @@ def test_an_action_means_a_way_from_where_the_gripper_is_measured():
     np.testing.assert_allclose(np.diff(path), -0.0025, rtol=1e-3)  # spread evenly over the step
 
 
+def test_least_height_and_opening_are_those_of_the_policys_robot():
+    other = PANDA.model_copy(update={"lowest_m": 0.03, "opening_m": 0.108})
+    policy = Steady([0.0, 0.0, -1.0, 1.0])
+    for safety, lowest_m, widest_m in (
+        ({}, 0.03, 0.108),
+        ({"lowest_m": 0.02, "max_width_m": 0.05}, 0.02, 0.05),
+    ):
+        robot = FakeRobot()
+        world = WORLD.model_copy(update={"robot": other})
+        Bridge(policy, robot, robot.poses, world, BridgeConfig(safety=safety)).run(OBJECT_M, 20)
+        assert min(command.effector_m[2] for _, command in robot.commands) == pytest.approx(lowest_m)
+        assert {command.width_m for _, command in robot.commands} == {widest_m}
+
+
 @pytest.mark.parametrize("wrong", [{"lowest_m": 0.45}, {"lower_m": (0.1, 0.0, 0.0), "upper_m": (0.0, 0.1, 0.1)}])
 def test_a_box_with_nothing_in_it(wrong):
     with pytest.raises(ConfigError, match=r"the box x .* is empty"):
-        SafetyConfig(**wrong).box(WORLD.workspace)
+        SafetyConfig(**wrong).box(WORLD)
