@@ -28,10 +28,14 @@ class DisturbanceConfig(FrozenModel):
 
 
 def _as_of(time_s: float, kept: deque[_Measurement]) -> _Measurement:
-    """The newest measurement of that time or before, or else the oldest that there is; those before it are dropped."""
+    """The newest measurement of that time or before; those before it are dropped.
+
+    Where there is none yet, the oldest that there is, as if it were of that time: a camera that is late does not show a
+    still picture before its first one.
+    """
     while len(kept) > 1 and kept[1].time_s <= time_s + _SAME_TIME_S:
         kept.popleft()
-    return kept[0]
+    return kept[0] if kept[0].time_s <= time_s + _SAME_TIME_S else replace(kept[0], time_s=time_s)
 
 
 class DisturbedRobot:

@@ -189,6 +189,15 @@ def test_measurements_two_steps_late_are_not_taken_for_frozen_ones_at_any_time_o
         assert not robot.stops
 
 
+@pytest.mark.parametrize("late", [{"pose_delay_s": 0.12}, {"state_delay_s": 0.09}])
+def test_what_is_later_than_a_time_stamp_may_stay_the_same_is_not_taken_for_frozen(late):
+    """But no later than a measurement may be."""
+    robot, config = FakeRobot(), DisturbanceConfig(**late)
+    disturbed, poses = DisturbedRobot(robot, config), DisturbedPoses(robot.poses, robot.now_s, config)
+    Bridge(Steady([0.1, 0.0, 0.0, 0.0]), disturbed, poses, WORLD, CONFIG).run(OBJECT_M, 6)
+    assert not robot.stops
+
+
 def test_an_arm_that_does_not_follow_is_stopped():
     robot, config = FakeRobot(lag_s=1e9), BridgeConfig(safety={"max_tracking_error_m": 0.02})
     with pytest.raises(RobotError, match="m from where it was sent"):
