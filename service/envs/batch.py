@@ -17,7 +17,7 @@ from service.envs.observations import ACTION, COMMAND_PREFIX, Layouts, Observati
 from service.envs.randomisation import KEYS, ModelBank, normal
 from service.envs.reach import reach_of
 from service.envs.robot import Robot, described
-from service.envs.sampling import Places, draw_starts, gripper_boxes, join
+from service.envs.sampling import Places, draw_starts, gripper_boxes, inside_gripper_or_table, join
 from service.envs.scene import FIXTURE_PREFIX, build_layout
 from service.envs.state_layout import OBSTACLE_PREFIX, obstacle_columns, places_at, pose_columns
 
@@ -373,7 +373,9 @@ class WorldBatch:
         self._check_start(state)
         # Where there is no room, it is said now.
         places = draw_starts(np.random.default_rng(0), _NUM_TRIED_STARTS, self.bank.largest, self.gripper_at_start)
-        if self.config.obstacles or self.config.objects:  # before the first reset, too, nothing is inside another
+        as_built = places_at(state[None], self._objects).reshape(1, -1)
+        inside = inside_gripper_or_table(as_built, self.config, self.gripper_at_start).any()
+        if self.config.obstacles or self.config.objects or inside:  # before the first reset, too, nothing is in another
             state[self.layout["box_place"]] = places.box[0]
             places_at(state[None], self._objects)[:] = each_object(places.object[:1])
             places_at(state[None], self._objects)[:, :, 2] = self.config.rest_heights_m

@@ -29,7 +29,10 @@ class Simulator(Protocol):
     """What a simulated robot offers besides: new starts, and the truth."""
 
     def reset(self, object_m: StateArray) -> None:
-        """Put the arm to its start with an open gripper, and the object to (3,) metres, at rest; time goes on."""
+        """Put the arm to its start with an open gripper, and the object on the table at (3,) metres; time goes on.
+
+        How high it lies is the simulator's to say: its object may be another than that of the policy's world.
+        """
 
     def object_position(self) -> StateArray:
         """(3,) where the object is in truth, metres."""

@@ -136,10 +136,10 @@ class MujocoRobot:
     # --- the simulator -----------------------------------------------------------------------------------------------
 
     def reset(self, object_m: StateArray) -> None:
-        """Put the arm to its start with an open gripper, and the object to (3,) metres, at rest; time goes on."""
+        """Put the arm to its start with an open gripper, and the object on the table at (3,) metres; time goes on."""
         now_s, layout = self._data.time, self._layout
         state = self._start.copy()
-        state[layout["object"]] = object_m
+        state[layout["object"]] = [*object_m[:2], self.world.rest_height_m]
         mujoco.mj_setState(self.model, self._data, state[layout.physics], mujoco.mjtState.mjSTATE_FULLPHYSICS)
         self._data.time, self._stopped = now_s, False
         self._last = (now_s, None)

@@ -155,13 +155,14 @@ class PyBulletRobot:
     # --- as a simulator ----------------------------------------------------------------------------------------------
 
     def reset(self, object_m: StateArray) -> None:
-        """Put the arm at home, the gripper open, and the object at a (3,) place; time goes on."""
+        """Put the arm at home, the gripper open, and the object on the table at a (3,) place; time goes on."""
         self._stopped = self._held = False
         self._bullet.restoreState(self._fresh)
         self._set_joints(self._home)
         for finger in _FINGERS:
             self._bullet.resetJointState(self._robot, finger, 0.0 if self.world.gripper == "blocked" else _STROKE_M)
-        self._bullet.resetBasePositionAndOrientation(self._object, np.asarray(object_m).tolist(), (0, 0, 0, 1))
+        place = (*np.asarray(object_m[:2]).tolist(), self.world.rest_height_m)
+        self._bullet.resetBasePositionAndOrientation(self._object, place, (0, 0, 0, 1))
         self._bullet.resetBaseVelocity(self._object, (0, 0, 0), (0, 0, 0))
         self.command(Command(np.array(self._start_m()), 2 * _STROKE_M))
         self._hold()

@@ -19,7 +19,7 @@ from service.base.types import StateArray
 from service.config.frozen import first_error
 from service.config.world import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.sampling import Places, draw_goals, draw_objects
+from service.envs.sampling import Places, draw_goals, draw_objects, draw_starts
 from service.media.recording import RecordedEpisodes
 from service.methods.compose import check_robot
 from service.registry.loading import Trained
@@ -86,7 +86,7 @@ def play(
         RobotError: the robot was stopped.
     """
     rng = np.random.default_rng(seed)
-    places = draw_objects(rng, num_episodes, policy.world)
+    places = _starts(rng, num_episodes, policy.world, simulated=backend.simulator is not None)
     goals = np.zeros((num_episodes, 3))
     if goal_m is None:
         goals = draw_goals(policy.tried_on.goal_kind, rng, policy.world, policy.success_distance_m, places)
@@ -101,6 +101,14 @@ def play(
         if backend.simulator is not None:
             distance_m = float(np.linalg.norm(backend.simulator.object_position() - goal))
         yield Outcome(goal, distance_m, distance_m <= policy.success_distance_m)
+
+
+def _starts(rng: np.random.Generator, num: int, world: WorldConfig, *, simulated: bool) -> Places:
+    """Random starts as in training; of a real robot nothing is put there, and no world has to be built."""
+    if not simulated:
+        return draw_objects(rng, num, world)
+    with WorldBatch(world, 1, num_threads=1) as worlds:
+        return draw_starts(rng, num, world, worlds.gripper_at_start)
 
 
 def _goal_from(backend: Backend, rng: np.random.Generator, policy: Trained) -> StateArray:

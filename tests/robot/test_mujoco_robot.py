@@ -101,6 +101,19 @@ def test_a_stopped_arm_holds_and_refuses():
     robot.command(Command(robot.read().effector_m, 0.0))
 
 
+def test_its_object_starts_on_the_table_beside_the_gripper():
+    """Whatever size it has here, and before the first start, too."""
+    robot = MujocoRobot(WORLD, MujocoParameters(object_size_m=0.07))
+    robot.reset(np.array([0.0, 0.1, 0.025]))
+    np.testing.assert_allclose(robot.object_position(), [0.0, 0.1, 0.035])
+    tall = WORLD.model_validate(WORLD.model_dump() | {"object": {"shape": "box", "size_m": (0.05, 0.05, 0.15)}})
+    robot = MujocoRobot(tall)
+    before = robot.object_position(), robot.read().effector_m
+    robot.wait_until(0.4)
+    np.testing.assert_allclose(robot.object_position(), before[0], atol=1e-3)
+    np.testing.assert_allclose(robot.read().effector_m, before[1], atol=1e-3)
+
+
 def test_parameters_change_the_arm_and_the_grip():
     robot = MujocoRobot(WORLD, MujocoParameters(stiffness_scale=2.0, object_mass_kg=0.5, joint_friction_nm=1.0))
     usual = MujocoRobot(WORLD)

@@ -52,6 +52,11 @@ def test_it_starts_as_our_worlds_do_in_our_frame(robot):
     assert state.effector_m[2] - grasp[0][2] == pytest.approx(0.0016, abs=1e-5)
 
 
+def test_its_cube_starts_on_the_table_whatever_the_policys_is(robot):
+    robot.reset(np.array([0.05, 0.08, 0.025]))  # panda-gym's cube lies at 0.02
+    np.testing.assert_allclose(robot.object_position(), PLACE, atol=1e-6)
+
+
 def test_it_goes_where_it_is_sent_in_metres_and_seconds(robot):
     robot.reset(PLACE)
     begin_s = robot.now_s()

@@ -5,6 +5,9 @@ import numpy as np
 import pytest
 
 from service.base.errors import TandemError
+from service.config import WorldConfig
+from service.envs.batch import WorldBatch
+from service.envs.sampling import draw_goals, draw_objects, inside_gripper_or_table
 from service.envs.task import Task
 from service.registry.bundled import BUNDLED
 from service.registry.loading import load
@@ -42,3 +45,25 @@ def test_a_policy_of_a_users_task_plays_goals_of_the_nearest_kind(tmp_path):
     outcomes = list(play(bridge, SimpleNamespace(simulator=None), policy, **given))
     assert [outcome.reached for outcome in outcomes] == [True] * 5
     assert min(outcome.goal_m[2] for outcome in outcomes) > 0.075
+
+
+@pytest.mark.parametrize("height_m", [0.05, 0.15])
+def test_a_simulators_object_starts_as_in_training(height_m, tmp_path):
+    """Beside the gripper where it is so high that it would start inside; else wherever it did before."""
+    found = for_robot(load("panda-cube@champion", tmp_path))
+    world = WorldConfig(object={"shape": "box", "size_m": (0.05, 0.05, height_m)})
+    policy, begun = replace(found, config=found.config.model_copy(update={"world": world})), []
+    simulator = SimpleNamespace(object_position=lambda: np.zeros(3))
+    backend = SimpleNamespace(simulator=simulator, begin=begun.append)
+    bridge = SimpleNamespace(run=lambda goal_m, num_steps: 0.0)
+    given = {"goal_m": None, "num_episodes": 30, "num_steps": 1, "seed": 3, "ready": lambda episode, goal_m: None}
+    goals = [outcome.goal_m for outcome in play(bridge, backend, policy, **given)]
+    rng = np.random.default_rng(3)
+    with WorldBatch(world, 1, num_threads=1) as worlds:
+        clear = ~inside_gripper_or_table(np.array(begun), world, worlds.gripper_at_start)
+    assert clear.all()
+    anywhere = draw_objects(rng, 30, world)
+    same = (anywhere.object == begun).all(axis=1)
+    assert same.sum() == 30 if height_m < 0.07 else 15 < same.sum() < 30
+    if same.all():
+        np.testing.assert_array_equal(goals, draw_goals("mixed", rng, world, policy.success_distance_m, anywhere))
