@@ -88,6 +88,9 @@ class Robot:
             orientation=robot.orientation,
         )
         _check_fingers(model, robot)
+        joints = [model.joint(prefix + finger.joint).id for finger in robot.fingers]
+        self.turning: BoolArray = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE
+        """(F,) fingers that turn, so that their servos have a torque; those of the others have a force."""
         self._closed = np.array([finger.closed for finger in robot.fingers])
         self._travel = np.array([finger.open for finger in robot.fingers]) - self._closed
         on_side = np.array([[finger.side in (side, "both") for side in _SIDES] for finger in robot.fingers])

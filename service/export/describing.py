@@ -81,6 +81,8 @@ def describe(
         joints = dict(zip(robot.joints, worlds.joints[0].tolist(), strict=True))
         effector_m, reach, fixtures = worlds.ee_position[0].tolist(), worlds.reach, _fixtures(worlds.model)
         width_m = float(worlds.robot.openings(worlds.states[:, worlds.layout["fingers"]]).sum())
+        turn = bool(worlds.robot.turning.any())
+    most = _each(robot.finger_max_force, robot)
     return {
         "format_version": 1,
         "name": trained.name if frozen is None else f"{trained.name} with {frozen.name}",
@@ -117,7 +119,8 @@ def describe(
         },
         "gripper": {  # numbers of each finger's servo: N, N/m, or N m, N m/rad
             "opening_m": robot.opening_m,
-            "max_force_n": _each(robot.finger_max_force, robot),  # this is the grip's force
+            "max_force_n": None if turn else most,  # this is the grip's force
+            "max_torque_nm": most if turn else None,  # of fingers that turn
             "stiffness": _each(robot.finger_stiffness, robot),
             "damping": _each(robot.finger_damping, robot),
             "coupling": _COUPLING,
@@ -288,7 +291,7 @@ arm that does at once what the action asks for moves too far.** Match the share 
 
 {response_table}
 
-{covered} A finger presses with up to {force_n:g} N; {gripper[coupling]}.
+{covered} A finger {pressing}; {gripper[coupling]}.
 
 {motion_table}
 
@@ -357,7 +360,7 @@ def make_readme(about: Description, start: FloatArray) -> str:
             for one in measured["width_response"]
             if one["asked_m"] > 0.0
         ),
-        force_n=max(about["gripper"]["max_force_n"]),
+        pressing=_pressing(about["gripper"]),
         motion_table=_table(
             (f"in {measured['motion']['num_episodes']} episodes", "median", "99 %", "greatest"),
             (
@@ -405,6 +408,12 @@ def program(about: Description, start: FloatArray) -> str:
         inputs=", ".join(f'"{one["name"]}": {given[one["name"]]}' for one in network["inputs"]),
         call=_CALL[name],
     )
+
+
+def _pressing(gripper: Mapping[str, Any]) -> str:
+    if gripper["max_force_n"] is None:
+        return f"turns with up to {max(gripper['max_torque_nm']):g} N m"
+    return f"presses with up to {max(gripper['max_force_n']):g} N"
 
 
 def _ranges(box: Mapping[str, Sequence[float]]) -> list[str]:

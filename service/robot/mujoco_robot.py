@@ -103,7 +103,8 @@ class MujocoRobot:
         self._data.ctrl[: self._robot.num_joints] = np.clip(solution, joints - MAX_TURN_RAD, joints + MAX_TURN_RAD)[0]
         width_m = np.clip([command.width_m], 0.0, self._widest_m)
         self._data.ctrl[self._fingers] = self._robot.finger_values(width_m)[0]
-        self.model.actuator_forcerange[self._fingers] = np.clip(self._grip, -command.grip_force_n, command.grip_force_n)
+        most = np.where(self._robot.turning, np.inf, command.grip_force_n)[:, None]  # a torque is no force
+        self.model.actuator_forcerange[self._fingers] = np.clip(self._grip, -most, most)
 
     def _led(self, solution: StateArray) -> StateArray:
         """Joint set-points moved on by what the servos lag behind at the speed of the set-points."""

@@ -12,12 +12,24 @@ import numpy as np
 import pytest
 
 from service.base.errors import ParityError
+from service.config.robot import read_robot
 from service.export.exporting import export
 from service.export.measurements import measure, tolerated_late_steps
 from service.registry.bundled import BUNDLED
 from service.registry.loading import load
+from service.registry.publishing import publish
 from tests.cli.typed import assert_refused, tandem
-from tests.export.policies import MONOLITHIC, SEEN, WORLD, publish_bob, write_run, write_training
+from tests.envs.robots import GANTRY, GANTRY_DESCRIPTION, write_robot
+from tests.export.policies import (
+    CONFIG,
+    MONOLITHIC,
+    SEEN,
+    WORLD,
+    parameters_of,
+    publish_bob,
+    write_run,
+    write_training,
+)
 from tests.methods import skill_sets
 from tests.runs.runs import assert_one_line
 
@@ -124,6 +136,16 @@ def test_what_a_bridge_must_know(run, tmp_path):
         *("**An arm that does at once", "| 80 ms | ", "x -0.225 to 0.125", "box, 50 x 50 x 50 mm", "open by 80 mm"),
     ):
         assert said in readme.replace("Hold", "hold")
+
+
+def test_fingers_that_turn_have_a_torque(registry, tmp_path):
+    robot = read_robot(write_robot(tmp_path, GANTRY, GANTRY_DESCRIPTION, finger_max_force=[6.0, 5.0]))
+    config = CONFIG.model_copy(update={"world": WORLD.model_copy(update={"robot": robot})})
+    publish(registry, config, parameters_of(config), {})
+    export(load("made@1", registry.root), "numpy", tmp_path / "out", part="policy", num_episodes=2)
+    gripper = described(tmp_path / "out")["gripper"]
+    assert (gripper["max_force_n"], gripper["max_torque_nm"]) == (None, [6.0, 5.0])
+    assert "A finger turns with up to 6 N m; each" in (tmp_path / "out" / "README.md").read_text()
 
 
 def test_an_orchestrator_with_its_primitives(run, registry, tmp_path, monkeypatch):

@@ -3,12 +3,14 @@ import pytest
 
 from service.base.errors import RobotError, TandemError
 from service.config import WorldConfig
+from service.config.robot import read_robot
 from service.envs.batch import WorldBatch
 from service.robot.backends import ExactPoses
 from service.robot.calibrate import Calibration, read_calibration, write_calibration
 from service.robot.interface import Command
 from service.robot.loop import Bridge, BridgeConfig
 from service.robot.mujoco_robot import MujocoParameters, MujocoRobot, connect
+from tests.envs.robots import GANTRY, GANTRY_DESCRIPTION, write_robot
 
 JUMPS = BridgeConfig(
     pace=1.0,
@@ -122,6 +124,13 @@ def test_parameters_change_the_arm_and_the_grip():
     assert robot.model.dof_frictionloss[0] == usual.model.dof_frictionloss[0] + 1.0
     robot.command(Command(robot.read().effector_m, 0.0, grip_force_n=10.0))
     assert np.abs(robot.model.actuator_forcerange[7:9]).max() == 10.0
+
+
+def test_a_grip_force_does_not_bound_the_torque_of_fingers_that_turn(tmp_path):
+    turning = read_robot(write_robot(tmp_path, GANTRY, GANTRY_DESCRIPTION, finger_max_force=6.0))
+    robot = MujocoRobot(WORLD.model_copy(update={"robot": turning}))
+    robot.command(Command(robot.read().effector_m, 0.0, grip_force_n=2.0))
+    np.testing.assert_array_equal(robot.model.actuator_forcerange[3:5], [[-6.0, 6.0]] * 2)
 
 
 @pytest.mark.parametrize(
