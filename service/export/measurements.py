@@ -81,7 +81,8 @@ def tolerated_late_steps(measured: Measured) -> int:
 
 def measure_response(world: WorldConfig) -> Measured:
     """Measure how far the arm and the gripper come in the step of a full action, without anything in their way."""
-    empty = world.model_copy(update={"fixture": "none", "fixtures": ()})
+    seen = world.observed.model_copy(update={"obstacles": False})
+    empty = world.model_copy(update={"fixture": "none", "fixtures": (), "obstacles": (), "observed": seen})
     rng = np.random.default_rng(REPORTED_SEED)
     with WorldBatch(empty, _NUM_PLACES) as worlds:
         widest_m = worlds.robot.opening_m if world.gripper == "free" else 0.0

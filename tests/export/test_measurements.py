@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.actors.evaluation import IdlePolicy
-from service.config import RunConfig
+from service.config import RunConfig, WorldConfig
 from service.config.world import ObservedConfig
 from service.envs.observations import ACTION, layouts
 from service.export.measurements import measure, measure_response, tolerated_late_steps
@@ -89,6 +89,14 @@ def test_the_arm_covers_a_part_of_a_full_action():
     for each in measured["width_response"]:
         assert each["asked_m"] == 0.08
         assert 0.06 < each["covered_m"] < 0.08
+
+
+def test_obstacles_are_not_in_the_arms_way():
+    tall = {"shape": "box", "size_m": (0.06, 0.06, 0.25), "mass_kg": 1.0}
+    obstructed = WorldConfig.model_validate(
+        WORLD.model_dump() | {"obstacles": [tall] * 3, "observed": {"num_commands": 2, "obstacles": True}}
+    )
+    assert measure_response(obstructed) == measure_response(WORLD)
 
 
 def test_a_gripper_that_is_held_closed_covers_nothing():
