@@ -27,7 +27,7 @@ GOAL_KINDS: tuple[GoalKind, ...] = (TABLE, "air", "mixed", "volume", "one")
 MIXED_AIR_SHARE = 0.7
 """Share of mixed goals drawn anywhere in the workspace's volume; the rest lie on the table (paper: p = 0.7)."""
 _NUM_DRAWS = 20
-"""Of the place of one obstacle, before all in a world are drawn anew."""
+"""Of the place of one obstacle, or of the object beside a box, before all in a world are drawn anew."""
 _NUM_ARRANGEMENTS = 60
 _MAX_DRAWS = 1000
 _TOUCHES_M = 0.001
@@ -78,14 +78,16 @@ def draw_objects(rng: np.random.Generator, num: int, config: WorldConfig) -> Pla
     Without a fixture, anywhere on the table inside the workspace; so far from fixtures that are described that an open
     finger fits between. Beside a wall, in one of its two areas, either with equal chance. With a box, the box's middle
     is anywhere in the workspace, and the object outside of it: as far as from other fixtures.
+
+    Raises:
+        ConfigError: there is no room.
     """
     box, no_obstacles = np.empty((num, 0)), np.empty((num, 0, 3))
     if config.fixture == "wall":
         return Places(_beside_wall(rng, rng.choice((-1.0, 1.0), num), config), box, no_obstacles)
     position = _clear_of_fixtures(lambda num: _on_table(rng, num, config), num, config, _BESIDE_OBJECT_M, config.shape)
     if config.fixture == "box":
-        box = position * (1.0, 1.0, 0.0)
-        position = _outside_boxes(rng, box, config)
+        position, box = _beside_boxes(rng, position * (1.0, 1.0, 0.0), config)
     return Places(position, box, no_obstacles)
 
 
@@ -177,14 +179,25 @@ def _beside_wall(rng: np.random.Generator, side: StateArray, config: WorldConfig
     return position
 
 
-def _outside_boxes(rng: np.random.Generator, place: StateArray, config: WorldConfig) -> StateArray:
-    """(num, 3) object centres in the workspace, each drawn again until it is clear of its box."""
+def _beside_boxes(rng: np.random.Generator, box: StateArray, config: WorldConfig) -> tuple[StateArray, StateArray]:
+    """(num, 3) object centres in the workspace, and (num, 3) boxes; each is drawn again until both are clear.
+
+    Raises:
+        ConfigError: there is no room.
+    """
     apart = scene.BOX_SIZE_M / 2 + np.array(config.shape.extent_m[:2]) / 2
     least = apart + np.array([scene.GAP_M, scene.FINGER_GAP_M])
-    position = _on_table(rng, len(place), config)
-    while (inside := (np.abs(position - place)[:, :2] < least).all(axis=1)).any():
-        position[inside] = _on_table(rng, int(inside.sum()), config)
-    return position
+    position, box = _on_table(rng, len(box), config), box.copy()
+    for _ in range(_NUM_ARRANGEMENTS):
+        for _ in range(_NUM_DRAWS):
+            inside = (np.abs(position - box)[:, :2] < least).all(axis=1)
+            if not inside.any():
+                return position, box
+            position[inside] = _on_table(rng, int(inside.sum()), config)
+        box[inside] = _on_table(rng, int(inside.sum()), config) * (1.0, 1.0, 0.0)
+    raise ConfigError(
+        "world.fixture = 'box': no room in the workspace for the object beside the box: make world.workspace larger"
+    )
 
 
 # --- goals ------------------------------------------------------------------------------------------------------------

@@ -109,6 +109,31 @@ def test_a_long_object_starts_clear_of_a_fixture(fixture):
         assert ((away[:, 0] >= 0.05 + 0.06 + 0.005) | (away[:, 1] >= 0.05 + 0.015 + 0.04)).all()
 
 
+class Counted:
+    """Random numbers for a while."""
+
+    def __init__(self, num):
+        self._rng, self._left = np.random.default_rng(0), num
+
+    def uniform(self, *given):
+        self._left -= 1
+        assert self._left >= 0, "it draws for ever"
+        return self._rng.uniform(*given)
+
+
+def test_a_workspace_in_which_most_places_of_the_box_leave_no_room():
+    world = WorldConfig(fixture="box", workspace={"length_x_m": 0.12, "length_y_m": 0.15})
+    position, box, _ = draw_objects(Counted(5000), 200, world)
+    away = np.abs(position - box)[:, :2]
+    assert ((away[:, 0] >= 0.05 + 0.025 + 0.005) | (away[:, 1] >= 0.05 + 0.025 + 0.04)).all()
+    for place in (position, box):
+        assert (np.abs(place[:, :2] - [-0.05, 0.0]) <= [0.06, 0.075]).all()
+    world = WorldConfig(fixture="box", workspace={"length_x_m": 0.07, "length_y_m": 0.11})
+    with pytest.raises(ConfigError) as error:
+        draw_objects(Counted(5000), 1, world)
+    assert_one_line(error.value, "no room in the workspace for the object beside the box", "world.workspace larger")
+
+
 def test_an_object_wider_than_the_gripper_opens():
     with pytest.raises(ConfigError) as error:
         WorldBatch(WorldConfig(object={"shape": "box", "size_m": (0.05, 0.09, 0.05)}), 1)
