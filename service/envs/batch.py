@@ -128,6 +128,13 @@ class WorldBatch:
         return self._of_objects("object_velocity")
 
     @property
+    def rest_heights(self) -> StateArray:
+        """(N, K) height of each object's centre as it lies on the table of its world, metres."""
+        model = self.states[:, self.layout["model"]].sum(axis=1)  # 0 where there is but one, and no such column
+        heights: StateArray = self.bank.rest_height_m[model.astype(np.intp)]
+        return heights
+
+    @property
     def box_place(self) -> StateArray:
         """(N, 3) middle of the bottom of each world's box, metres; (N, 0) in worlds without."""
         return self.states[:, self.layout["box_place"]]
@@ -374,7 +381,8 @@ class WorldBatch:
         # Where there is no room, it is said now.
         places = draw_starts(np.random.default_rng(0), _NUM_TRIED_STARTS, self.bank.largest, self.gripper_at_start)
         as_built = places_at(state[None], self._objects).reshape(1, -1)
-        inside = inside_gripper_or_table(as_built, self.config, self.gripper_at_start).any()
+        rest_m = np.array(self.config.rest_heights_m)
+        inside = inside_gripper_or_table(as_built, self.config, self.gripper_at_start, rest_m).any()
         if self.config.obstacles or self.config.objects or inside:  # before the first reset, too, nothing is in another
             state[self.layout["box_place"]] = places.box[0]
             places_at(state[None], self._objects)[:] = each_object(places.object[:1])

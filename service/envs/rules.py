@@ -82,11 +82,16 @@ class Rules:
     def place(self, rng: np.random.Generator, worlds: slice = _ALL) -> None:
         """Put objects where the task has them start, in worlds that are at a random start; it may say nothing.
 
+        Where one is lower than it lies in its world, whose table and sizes may be drawn, all of the world are raised.
+
         Raises:
             CodeError: the function gives something else, or no places that are within reach and clear.
         """
         if self.task.starts is not None:
-            self._worlds.put_objects(self._places("starts", rng, worlds), worlds)
+            place = self._places("starts", rng, worlds)
+            height = each_object(place)[:, :, 2]  # a view
+            height += (self._worlds.rest_heights[worlds] - height).max(axis=1, keepdims=True).clip(min=0.0)
+            self._worlds.put_objects(place, worlds)
 
     def _places(self, name: str, rng: np.random.Generator, worlds: slice) -> StateArray:
         """(N, 3 K) places by a function of the task; drawn again where they are out of reach, or inside something."""
@@ -101,7 +106,9 @@ class Rules:
             wrong = self.out_of_reach(place) | inside_fixtures(place, config)
             wrong |= inside_obstacles(place, obstacles, config) | inside_each_other(place, config)
             if name == "starts":
-                wrong |= inside_gripper_or_table(place, config, batch.gripper_at_start)
+                # It may know heights as they are in its world, or as the configuration has them.
+                rest_m = np.minimum(config.rest_heights_m, batch.rest_heights[worlds])
+                wrong |= inside_gripper_or_table(place, config, batch.gripper_at_start, rest_m)
             if not wrong.any():
                 return place
         where = place_of(getattr(self.task, name))[1]

@@ -403,9 +403,12 @@ def inside_each_other(position: StateArray, config: WorldConfig) -> BoolArray:
     return inside
 
 
-def inside_gripper_or_table(position: StateArray, config: WorldConfig, gripper: Boxes) -> BoolArray:
-    """(N,) whether an object at its place of (N, 3 K) would be more than a millimetre inside of these."""
-    low = (each_object(position)[:, :, 2] < np.subtract(config.rest_heights_m, _TOUCHES_M)).any(axis=1)
+def inside_gripper_or_table(position: StateArray, config: WorldConfig, gripper: Boxes, rest_m: StateArray) -> BoolArray:
+    """(N,) whether an object at its place of (N, 3 K) would be more than a millimetre inside of these.
+
+    On the table, objects rest at heights of (K,) or (N, K) ``rest_m``.
+    """
+    low = (each_object(position)[:, :, 2] < rest_m - _TOUCHES_M).any(axis=1)
     inside: BoolArray = low | _some_object(position, config, lambda around: _overlap(_smaller(around), gripper))
     return inside
 

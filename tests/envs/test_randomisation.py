@@ -8,6 +8,8 @@ from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import POSITIONS
 from service.envs.randomisation import KEYS, ModelBank, normal
+from service.envs.rules import Rules
+from service.envs.task import Task
 
 COARSE = {"physics_step_s": 0.005, "num_substeps": 8}
 EVERYTHING = {
@@ -193,3 +195,31 @@ def test_saved_states_go_on_exactly_in_another_batch():
         np.testing.assert_array_equal(one.states, other.states)
         np.testing.assert_array_equal(one.positions(), other.positions())
         assert len(np.unique(one.states[:, one.layout["model"]])) > 1
+
+
+def test_a_tasks_own_starts_are_on_the_table_of_their_world():
+    config = world(num_models=8, table_height_m=[-0.01, 0.01], object_size=[0.75, 1.25])
+    rng = np.random.default_rng(0)
+    with WorldBatch(config, 32, num_threads=1) as worlds:
+        worlds.reset(rng)
+        before, rest = worlds.object_position.copy(), worlds.rest_heights
+        np.testing.assert_array_equal(before[:, 2:], rest)
+        assert rest.min() < 0.02 < 0.03 < rest.max()
+        Rules(Task("Kept", starts=lambda s, rng: s.objects.place), worlds).place(rng)
+        np.testing.assert_array_equal(worlds.object_position, before)
+        fixed = Task("Fixed", starts=lambda s, rng: np.broadcast_to([0.0, 0.1, 0.025], s.objects.place.shape))
+        Rules(fixed, worlds).place(rng, slice(0, 16))
+        np.testing.assert_allclose(worlds.object_position[:16, 2:], np.maximum(rest[:16], 0.025))
+        np.testing.assert_array_equal(worlds.object_position[16:], before[16:])
+
+
+def test_what_stands_on_another_is_raised_with_it():
+    config = world(num_models=8, table_height_m=[-0.01, 0.01])
+    config = WorldConfig.model_validate(config.model_dump() | {"objects": ["cube", "cube"], "start_height_m": 0.2})
+    rng, stack = np.random.default_rng(0), [[0.0, 0.1, 0.025], [0.0, 0.1, 0.075]]
+    with WorldBatch(config, 32, num_threads=1) as worlds:
+        worlds.reset(rng)
+        Rules(Task("Stack", starts=lambda s, rng: np.tile(stack, (len(s.elapsed), 1, 1))), worlds).place(rng)
+        lower, upper = worlds.object_position[:, 2], worlds.object_position[:, 5]
+        np.testing.assert_allclose(lower, np.maximum(worlds.rest_heights[:, 0], 0.025))
+        np.testing.assert_allclose(upper - lower, 0.05)

@@ -60,7 +60,7 @@ def test_a_simulators_object_starts_as_in_training(height_m, tmp_path):
     goals = [outcome.goal_m for outcome in play(bridge, backend, policy, **given)]
     rng = np.random.default_rng(3)
     with WorldBatch(world, 1, num_threads=1) as worlds:
-        clear = ~inside_gripper_or_table(np.array(begun), world, worlds.gripper_at_start)
+        clear = ~inside_gripper_or_table(np.array(begun), world, worlds.gripper_at_start, worlds.rest_heights)
     assert clear.all()
     anywhere = draw_objects(rng, 30, world)
     same = (anywhere.object == begun).all(axis=1)
