@@ -31,7 +31,8 @@ Image = NDArray[np.uint8]
 _GOAL_COLORS = ((0.0, 0.62, 0.45), (0.90, 0.62, 0.0))
 _GOAL_ALPHA, _DROP_ALPHA = 0.45, 0.7
 _DROP_RADIUS_M, _FOOT_RADIUS_M, _FOOT_HALF_HEIGHT_M = 0.0015, 0.012, 0.0006
-_MAX_GEOMS = 200
+_MORE_GEOMS = 200
+"""That may be drawn beyond those of the model: three for each goal, and tendons of a user's robot."""
 _NUM_SAMPLES = 4
 _NOT_TURNED = np.eye(3).ravel()
 
@@ -59,7 +60,7 @@ class SceneRenderer:
         self._goals = list(zip(map(geometry, config.bodies), config.rest_heights_m, colors, strict=True))
         self._rectangle = mujoco.MjrRect(0, 0, width, height)
         self._option = mujoco.MjvOption()
-        self._scene = mujoco.MjvScene(self.model, maxgeom=_MAX_GEOMS)
+        self._scene = mujoco.MjvScene(self.model, maxgeom=self.model.ngeom + _MORE_GEOMS)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
         self._context, self._drawing = open_drawing(self.model, width, height)
 

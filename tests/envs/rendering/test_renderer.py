@@ -126,6 +126,16 @@ def test_a_sphere_is_round():
     assert mask.sum() == pytest.approx(np.pi / 4 * height * width, rel=0.15)
 
 
+def test_a_goal_is_drawn_however_many_pieces_a_world_has():
+    shelf = WorldConfig(fixtures=({"shape": "box", "size_m": (0.05, 0.05, 0.05), "position_m": (0.1, 0.3)},))
+    config = shelf.model_copy(update={"fixtures": shelf.fixtures * 250})
+    state = state_with_object_at(0.1, 0.1, 0.025)
+    with open_renderer(config) as renderer:
+        without, with_goal = renderer.render(state), renderer.render(state, GOAL)
+    column, row = map(round, project(GOAL, renderer.camera, renderer.model))
+    assert (with_goal[row, column] != without[row, column]).any()
+
+
 def test_the_flag_of_a_blocked_gripper_moves_no_box():
     """The flag of a blocked gripper stands behind the box's place in a state."""
     config = WorldConfig(fixture="box")
