@@ -77,7 +77,7 @@ class FrankaRobot:
                 raise RobotError(self._words("it has errors: look at Desk, mend their cause, and unlock it again"))
             self._robot.set_collision_behavior(parameters.max_contact_torque_nm, parameters.max_contact_force_n)
             # In any direction: one that is turned about the vertical would be turned back by the first command.
-            turn_rad = 2.0 * float(np.arccos(min(abs(np.ravel(self._pose().quaternion) @ _DOWN), 1.0)))
+            turn_rad = 2.0 * float(np.arccos(min(abs(float(np.ravel(self._pose().quaternion) @ _DOWN)), 1.0)))
             if not turn_rad <= _MOST_TURN_RAD:
                 where = "pointing down with its left finger on the side of negative y"
                 raise RobotError(self._words(f"its gripper is {turn_rad:.1f} rad off {where}: guide it there"))
