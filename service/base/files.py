@@ -126,6 +126,17 @@ def write_exclusive(path: Path, data: bytes) -> bool:
         return True
 
 
+def check_place(path: Path) -> None:
+    """Check that a file can be written at ``path``, before the work whose result it is to hold; nothing stays there.
+
+    Raises:
+        StorageError: it cannot.
+    """
+    with os_errors("write", path), _temporary(path, b"", flush=False):
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+
+
 @contextlib.contextmanager
 def new_directory(path: Path) -> Iterator[Path]:
     """Give an empty directory beside ``path``, which takes that name when the block ends well, and else is removed.
@@ -159,9 +170,11 @@ def os_errors(
         reason = error.strerror or type(error).__name__
         if action == "read":
             raise error_type(f"cannot read {path}: {reason}; check the path, its permissions and the disk") from error
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        to_do = "free some space" if full else "check the path and its permissions"
         raise error_type(
-            f"cannot write {path}: {reason}{_free_there(path)}; "
-            "free some space or check the permissions and try again; what was saved before is intact"
+            f"cannot write {path}: {reason}{_free_there(path) if full else ''}; {to_do} and try again; "
+            "what was saved before is intact"
         ) from error
 
 
@@ -213,7 +226,8 @@ class Appender:
             StorageError: as for `append_bytes`.
         """
         self._flush()
-        with os_errors("write", self.path), contextlib.suppress(FileNotFoundError), open_regular(self.path) as file:
+        nothing_there = contextlib.suppress(FileNotFoundError, NotADirectoryError)
+        with os_errors("write", self.path), nothing_there, open_regular(self.path) as file:
             os.fsync(file.fileno())
 
     def _flush(self) -> None:

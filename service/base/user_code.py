@@ -6,6 +6,7 @@ file. Nothing here is run unless somebody asks for it by ``find``.
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import linecache
 import sys
@@ -131,12 +132,13 @@ def run(origin: str, text: str) -> ModuleType:
 
 @contextmanager
 def naming_errors_of(origin: str) -> Iterator[None]:
-    """Say of any error inside, in one line, where in the code of ``origin`` it comes from."""
+    """Say of any error inside, in one line, where in the code of ``origin`` it comes from; it prints to stderr."""
     try:
-        yield
+        with contextlib.redirect_stdout(sys.stderr):  # stdout has what was asked for, such as JSON
+            yield
     except CodeError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == origin]
         said = " ".join(str(error).split())
         if isinstance(error, SyntaxError) and error.filename == origin:  # and not of what it imports

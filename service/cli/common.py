@@ -47,7 +47,8 @@ EXIT_SIGNAL = 128
 
 def _of_this_machine(value: Path) -> Path:
     if str(value).startswith(("http:", "https:")):
-        raise typer.BadParameter(f"{value} is a service; give the directory of a registry", param_hint="--registry")
+        url = str(value).replace(":/", "://", 1)  # a path has single slashes
+        raise typer.BadParameter(f"{url} is a service; give the directory of a registry", param_hint="--registry")
     return value
 
 
@@ -160,6 +161,14 @@ def loading() -> AbstractContextManager[Task]:
     return doing("loading", aloud=False)
 
 
+class Terminal(Console):
+    """A terminal, or what is in its place, that may go away: then a command goes on without a word."""
+
+    def on_broken_pipe(self) -> None:
+        """Say nothing more; rich would end the process."""
+        self.quiet = True
+
+
 class CommandGroup(TyperGroup):
     """A group of commands in which every error is one line on stderr and an exit code.
 
@@ -179,7 +188,7 @@ class CommandGroup(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was typed; progress is shown on stderr."""
-        with _one_line(), nullcontext() if display() is not None else Display(Console(stderr=True)):
+        with _one_line(), nullcontext() if display() is not None else Display(Terminal(stderr=True)):
             return super().invoke(ctx)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import typer
 
 from service.base.errors import TandemError, in_metres, one_line
-from service.base.files import write_atomic
+from service.base.files import check_place, write_atomic
 from service.cli.common import (
     SOURCE,
     ActsWithOption,
@@ -112,6 +112,8 @@ def evaluate(
         raise TandemError(f"--out {out}: {trained.label} has learned, and its run has the result.json; leave out --out")
     if out is not None and out.exists():  # now, not after playing
         raise TandemError(f"--out {out} is there already: name another file, or move it away")
+    if out is not None:
+        check_place(out)
     config = changed_config(trained.config, overrides or ())
     world, distance_m = replace(trained, config=config).world, trained.success_distance_m
     tried = trained.on_goals(cast("GoalKind | None", asked))

@@ -12,10 +12,11 @@ import typer
 from pydantic import ValidationError
 
 from service.base.errors import TandemError, in_metres
+from service.base.files import check_place
 from service.base.types import StateArray
 from service.cli.common import CHAMPION, REFERENCE, SOURCE, CommandGroup, SourceOption, print_json
 from service.cli.evaluate import parse_points
-from service.config.frozen import first_error
+from service.config.load import explained
 from service.config.tree import apply_override
 from service.config.world import WorldConfig
 from service.runs.signals import StopSignals
@@ -126,6 +127,7 @@ def calibrate(
     from service.robot.backends import read_backend
 
     config, described, player = _bridge_config(overrides), read_backend(robot), _load(policy, registry)
+    check_place(out)  # now, not after the arm has moved
     with _connected(described, player, 0, dead_man) as (backend, held, wait):
         wait("take everything out of the arm's way")
         found = measuring.calibrate(described.label, backend.robot, player.world, config, held=held)
@@ -172,7 +174,7 @@ def _bridge_config(overrides: list[str] | None) -> BridgeConfig:
     try:
         return BridgeConfig.model_validate(tree)
     except ValidationError as error:
-        raise TandemError(f"--set: {first_error(error)}") from None
+        raise TandemError(f"--set: {explained(error, BridgeConfig)}") from None
 
 
 def _load(policy: str, registry: str) -> Trained:

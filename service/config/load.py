@@ -66,14 +66,19 @@ def parse_config(tree: dict[str, Any], *, where: str) -> Config:
     try:
         return kind.model_validate(tree)
     except ValidationError as error:
-        first = error.errors()[0]
-        more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-        if first["type"] == "extra_forbidden":
-            *groups, name = (part for part in first["loc"] if isinstance(part, str) and part not in NO_KEYS)
-            prefix, keys = "".join(f"{group}." for group in groups), list(_keys(kind))
-            known = sorted(name for before, name in keys if before == prefix)
-            more = f"; known there: {', '.join(known)}{more}{_elsewhere(keys, name) or did_you_mean(name, known)}"
-        raise ConfigError(f"{where}: {first_error(error)}{more}") from None
+        raise ConfigError(f"{where}: {explained(error, kind)}") from None
+
+
+def explained(error: ValidationError, kind: type[BaseModel]) -> str:
+    """The first thing that is wrong with the tree of a model; of an unknown key, too, which are known there."""
+    first = error.errors()[0]
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    if first["type"] == "extra_forbidden":
+        *groups, name = (part for part in first["loc"] if isinstance(part, str) and part not in NO_KEYS)
+        prefix, keys = "".join(f"{group}." for group in groups), list(_keys(kind))
+        known = sorted(name for before, name in keys if before == prefix)
+        more = f"; known there: {', '.join(known)}{more}{_elsewhere(keys, name) or did_you_mean(name, known)}"
+    return f"{first_error(error)}{more}"
 
 
 def changed_config(config: Config, overrides: Sequence[str]) -> Config:

@@ -175,7 +175,7 @@ class Task:
         """The world of this task, for primitives that were trained in ``world``."""
         from pydantic import ValidationError
 
-        from service.config.frozen import first_error
+        from service.config.load import explained
 
         tree = world.model_dump()
         for key, value in self.world.items():
@@ -186,7 +186,7 @@ class Task:
         try:
             return type(world).model_validate(tree)
         except ValidationError as error:
-            raise CodeError(f"task {self.name or self.title}: world: {first_error(error)}") from None
+            raise CodeError(f"task {self.name or self.title}: world: {explained(error, type(world))}") from None
 
     def data(self) -> dict[str, Any]:
         """What a manifest keeps of a user's task: enough to act, without its functions."""

@@ -72,6 +72,12 @@ class TaskMethod:
             TandemError: of another kind, robot or layout, skills of another method, or primitives that cannot be
                 composed.
         """
+        if self.takes == "skills" and trained.kind != "skills":
+            name = self.skills or "lsd"
+            raise TandemError(
+                f"the method {self.title} needs skills, and {trained.label} has none: name some by --primitives, such "
+                f"as panda-cube-{name}@latest, which tandem train --method {name} makes"
+            )
         if self.takes is not None:
             trained.expect(self.takes, by=f"the method {self.title}")
         check_robot(trained)

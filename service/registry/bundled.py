@@ -51,6 +51,8 @@ def find_version(reference: str, root: Path | str) -> tuple[Registry, Version]:
     except UnknownVersionError as error:
         if bundled.versions(name):
             raise UnknownVersionError(f"{missing}; nor does one come with tandem: {error}") from None
+        if own.versions(name):
+            raise UnknownVersionError(missing) from None
         hint = did_you_mean(name, [*own.names(), *bundled.names()])
         raise UnknownVersionError(f"{missing}; with tandem comes: {', '.join(bundled.names())}{hint}") from None
 

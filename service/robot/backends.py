@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from pydantic import Field, ValidationError
 
-from service.base.errors import TandemError, one_line
+from service.base.errors import TandemError, did_you_mean, one_line
 from service.base.types import StateArray
 from service.config.frozen import FrozenModel, first_error
 from service.config.tree import read_yaml
@@ -101,8 +101,12 @@ def read_backend(reference: str) -> BackendConfig:
     if reference in BACKENDS or (":" in reference and not Path(reference).exists()):
         return BackendConfig(backend=reference)
     if not Path(reference).is_file():
-        known = ", ".join(BACKENDS)
-        raise TandemError(f"unknown robot {reference!r}: name {known}, module:function of your own, or a YAML file")
+        if Path(reference).suffix or "/" in reference:
+            raise TandemError(f"no file {reference}: name a YAML file of a robot, or one of {', '.join(BACKENDS)}")
+        raise TandemError(
+            f"unknown robot {reference!r}: name {', '.join(BACKENDS)}, module:function of your own, or a YAML file"
+            f"{did_you_mean(reference, BACKENDS)}"
+        )
     try:
         return BackendConfig.model_validate(read_yaml(Path(reference)))
     except ValidationError as error:

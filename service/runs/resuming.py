@@ -9,7 +9,7 @@ from typing import Any
 
 from service.base.errors import CheckpointError, ConfigError
 from service.config import Config, load_config
-from service.config.tree import leaves
+from service.config.tree import apply_override, leaves
 from service.store.run_directory import RunDirectory
 
 
@@ -26,7 +26,15 @@ def resumed_config(directory: RunDirectory | Path, overrides: list[str], file: P
     """
     read = partial(load_config, directory) if isinstance(directory, Path) else directory.read_config
     saved = read()
-    given = read(overrides) if file is None else load_config(file, overrides, saved.code)
+    tree: dict[str, Any] = {}
+    for override in overrides:
+        apply_override(tree, override)
+    try:
+        given = read(overrides) if file is None else load_config(file, overrides, saved.code)
+    except ConfigError:
+        if (method := tree.get("method", saved.method)) != saved.method:  # whose keys are others
+            raise ConfigError(f"the run learns by {saved.method}, not by {method}: name that, or another run") from None
+        raise
     if type(given) is type(saved):
         given = given.as_in(saved)
     for key, (old, new) in _differences(saved.model_dump(mode="json"), given).items():

@@ -288,6 +288,8 @@ class RunDirectory:
         return False
 
     def _check_free(self) -> None:
+        if self.path.exists() and not self.path.is_dir():
+            raise TandemError(f"{self.path} is no directory; name another --run-dir")
         if self.exists:
             raise TandemError(f"{self.path} holds a run already; continue it with --resume, or name another --run-dir")
         if (self.path / STUDY_FILE).is_file():

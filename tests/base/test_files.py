@@ -97,6 +97,17 @@ def test_what_killed_writers_left_is_removed_but_no_directory(tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == [".tmp-2-bb"]
 
 
+def test_a_place_that_cannot_be_written_is_known_before(tmp_path):
+    files.check_place(tmp_path / "new" / "file")
+    assert list((tmp_path / "new").iterdir()) == []
+    (tmp_path / "file").write_text("whole")
+    for path, said in ((tmp_path, "Is a directory"), (tmp_path / "file" / "below", "File exists")):
+        with pytest.raises(StorageError) as error:
+            files.check_place(path)
+        # room on the disk would not help
+        assert_one_line(error.value, f"cannot write {path}: {said}; check the path and its permissions")
+
+
 # --- regular files ---------------------------------------------------------------------------------------------------
 
 

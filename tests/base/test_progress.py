@@ -9,6 +9,7 @@ import pytest
 from rich.console import Console
 
 from service.base.progress import PLAIN_INTERVAL_S, Display, answer, counted, doing
+from service.cli.common import Terminal
 from tests.clock import Clock
 
 ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
@@ -124,3 +125,16 @@ def test_a_terminal_is_left_as_if_there_had_been_nothing(clock):
             wait_for("loading", shown)
             assert not any("stopping" in line for line in screen(shown))
         assert screen(shown) == ["a line"]
+
+
+def test_a_terminal_that_is_gone_ends_nothing():
+    """As with ``tandem train 2>&1 | head -1``: rich would end the process."""
+
+    class Gone(io.StringIO):
+        def write(self, text):
+            raise BrokenPipeError
+
+    with Display(Terminal(file=Gone())) as display:
+        display.say("a line")
+        display.say("another")
+    assert display.console.quiet

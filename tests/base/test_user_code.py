@@ -120,3 +120,14 @@ def test_what_has_changed_since(tmp_path, monkeypatch):
     for name in ("same", "other"):
         (tmp_path / f"{name}.py").write_text("A = 1")
     assert changed_since({"same.py": "A = 1", "other.py": "A = 2", "gone.py": "A = 1"}) == ["other.py"]
+
+
+def test_a_file_that_ends_the_program_is_told_as_any_error():
+    with pytest.raises(CodeError) as error:
+        found_in("import sys\nN = 1\nsys.exit(0)\n")
+    assert_one_line(error.value, "numbers.py:3: SystemExit: 0")
+
+
+def test_what_a_file_prints_is_no_output_of_the_command(capsys):
+    assert found_in("print('loading')\nN = 3\n") == 3
+    assert capsys.readouterr() == ("", "loading\n")

@@ -413,7 +413,7 @@ def test_a_goal_of_a_film_is_in_no_fixture():
         (["--registry", BUNDLED, "--run-dir", "run"], ["cannot write", BUNDLED, "only read"]),
         (["--resume", "--run-dir", "RUN", "--set", "seed=3"], ["seed = 3, but the run has 0", "only run.*"]),
         (["--resume", "--run-dir", "RUN", "--config", "OTHER"], ["seed = 3, but the run has 0", "without --resume"]),
-        (["--run-dir", "OTHER"], ["cannot write", "other.yaml"]),
+        (["--run-dir", "OTHER"], ["other.yaml is no directory"]),
     ],
 )
 def test_mistakes_of_pretrain(trained, monkeypatch, tmp_path, arguments, parts):

@@ -13,6 +13,7 @@ import pytest
 import typer
 from rich.console import Console
 
+from service.__main__ import main as command
 from service.base.errors import TandemError, did_you_mean
 from service.base.progress import Display
 from service.base.version import __version__
@@ -165,6 +166,20 @@ def test_what_quiet_does_not_print_is_in_the_log_of_the_run(monkeypatch, tmp_pat
         logging.getLogger("service.cluster").warning("rollout actor 3 is gone")
     assert [line.text for line in read_log(tmp_path)] == ["rollout actor 3 is back", "rollout actor 3 is gone"]
     assert printed.getvalue() == "rollout actor 3 is gone\n"
+
+
+def test_ctrl_c_while_the_command_is_loaded_is_quiet(monkeypatch):
+    class Interrupted:
+        @staticmethod
+        def find_spec(name, *_):
+            if name == "service.cli.main":
+                raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "service.cli.main")
+    monkeypatch.setattr(sys, "meta_path", [Interrupted, *sys.meta_path])
+    with pytest.raises(SystemExit) as ended:
+        command()
+    assert ended.value.code == 130
 
 
 def test_the_version():

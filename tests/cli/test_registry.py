@@ -164,4 +164,4 @@ def test_mistakes_are_one_line_and_exit_code_2(run: Run, tmp_path: Path) -> None
 @pytest.mark.parametrize("command", [["list"], ["show", "tiny"]])
 def test_a_service_is_no_directory(command):
     refused = tandem("registry", *command, "--registry", "http://127.0.0.1:9")
-    assert_refused(refused, "is a service; give the directory of a registry")
+    assert_refused(refused, "http://127.0.0.1:9 is a service; give the directory of a registry")

@@ -68,8 +68,11 @@ def test_a_dry_run_says_where_it_would_go_and_moves_nothing():
     assert "would go to" in first
 
 
-def test_what_calibrate_writes_run_reads(tmp_path):
+def test_what_calibrate_writes_run_reads(tmp_path, monkeypatch):
     out = tmp_path / "arm.yaml"
+    with monkeypatch.context() as patch:
+        patch.setattr("service.robot.calibrate.calibrate", None)  # it is refused before the arm moves
+        assert_refused(invoke("calibrate", "--robot", "mujoco", "--out", tmp_path, *FAST), "Is a directory")
     (tmp_path / "mine.yaml").write_text("backend: mujoco\nname: mine\nparameters: {feed_forward: 1.0}\n")
     made = invoke("calibrate", "--robot", "mine.yaml", "--out", out, *FAST)
     assert made.exit_code == 0, made.output
@@ -87,13 +90,18 @@ def test_what_calibrate_writes_run_reads(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--robot", "armm"], "unknown robot 'armm'"),
+        (
+            ["--robot", "mujocco"],
+            "unknown robot 'mujocco': name mujoco, pybullet, franka, module:function of your own, or a "
+            "YAML file; did you mean 'mujoco'?",
+        ),
+        (["--robot", "gone.yaml"], "no file gone.yaml: name a YAML file of a robot, or one of mujoco"),
         (["--robot", "mujoco", "--goal", "1,2,3"], "--goal: 1.000, 2.000, 3.000 is outside of the workspace"),
         (["--robot", "mujoco", "--goal", "here"], "--goal 'here': write a point x,y,z in metres\n"),
         (["--robot", "mujoco", "--goal", "0,0,0.02"], "--goal 0,0,0.02: write one point, no lower than"),
         (["--robot", "mujoco", "--goal", "0,0,0.2;0,0,0.1"], "0,0,0.1: write one point"),
         (["--robot", "mujoco", "--policy", "nobody@1"], "nobody"),
-        (["--robot", "mujoco", "--set", "safety.max_speed=1"], "--set: unknown key 'safety.max_speed'"),
+        (["--robot", "mujoco", "--set", "safety.max_speed=1"], "--set: unknown key 'safety.max_speed'; known there: "),
         (["--robot", "mujoco", "--set", "safety.lowest_m=0.49"], "m is empty: raise upper_m, or lower"),
         (["--robot", "mujoco", "--calibration", "none.yaml"], "no calibration none.yaml: tandem robot calibrate --out"),
         (["--robot", "mujoco", "--dead-man", "button"], "choose key or none"),

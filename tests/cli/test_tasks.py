@@ -122,7 +122,7 @@ def test_an_interrupted_run_is_published_and_a_running_one_is_not(tmp_path):
     assert Registry(tmp_path / "registry").manifest("tiny@1").parent == "early@1"
 
 
-def test_what_learns_nothing_is_measured_as_a_run_is(tmp_path):
+def test_what_learns_nothing_is_measured_as_a_run_is(tmp_path, monkeypatch):
     written = {}
     for method in ("idle", "asp-only"):
         done = tandem("evaluate", "--task", "push", "--method", method, "--episodes", 8, "--out", f"o/{method}.json")
@@ -142,8 +142,10 @@ def test_what_learns_nothing_is_measured_as_a_run_is(tmp_path):
     rows = json.loads(tandem("evaluate", "panda-cube", "--task", "push", "--episodes", 8, "--json").stdout)
     assert rows["idle"]["mean_distance_m"] == idle["evaluation"]["mean_distance_m"]
     assert rows[f"{CHAMPION} (bundled)"]["mean_distance_m"] == bob["evaluation"]["mean_distance_m"]
+    monkeypatch.setattr("service.actors.evaluation.evaluate", None)  # nothing is played
     for words, arguments in (
         ("o/idle.json is there already", ("--task", "push", "--method", "idle", "--out", "o/idle.json")),
+        ("File exists", ("--task", "push", "--method", "idle", "--out", "o/idle.json/x")),
         ("--method is for a task", ("--method", "idle")),
         ("--out is for a task", ("--out", "x.json")),
         ("--method ours learns: tandem train", ("--task", "push", "--method", "ours")),
@@ -175,7 +177,7 @@ def test_methods_and_tasks_are_listed():
         (["wall", "--primitives", "nothing@latest"], "nothing"),
         (["wall", "--from", "panda-cube@champion"], "--from is for self-play and distillation"),
         (["--method", "lsd", "--from", "panda-cube@champion"], "--from is for self-play; skill discovery begins anew"),
-        (["wall", "--method", "lsd"], "needs skills"),
+        (["wall", "--method", "lsd"], "such as panda-cube-lsd@latest, which tandem train --method lsd makes"),
         (["wall", "--runtime", "ray", "--status", "off"], "method = ours: it runs in one process"),
         (["wall", "--resume"], "--resume needs --run-dir"),
         (["wall", "--set", "gamma=0.9"], "did you mean sac.gamma?"),

@@ -73,6 +73,9 @@ def test_what_is_nowhere(registry: Registry, publish: Publish) -> None:
     assert f"no 'nobody' in the registry {registry.root}; it holds: panda-cup" in str(error.value)
     assert "with tandem comes: panda-cube" in str(error.value)
     with pytest.raises(UnknownVersionError) as error:
+        find_version("panda-cup@9", registry.root)
+    assert "with tandem comes" not in str(error.value)  # the name is right
+    with pytest.raises(UnknownVersionError) as error:
         find_version("panda-cube@best", registry.root)
     assert f"no alias 'best' in the registry {BUNDLED}" in str(error.value)
     assert f"no 'panda-cube' in the registry {registry.root}" in str(error.value)

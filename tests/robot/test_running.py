@@ -11,7 +11,7 @@ from service.envs.sampling import draw_goals, draw_objects, inside_gripper_or_ta
 from service.envs.task import Task
 from service.registry.bundled import BUNDLED
 from service.registry.loading import load
-from service.robot.running import for_robot, play
+from service.robot.running import for_robot, play, read_log
 from tests.export.policies import publish_bob, write_training
 from tests.methods.skill_sets import made
 
@@ -34,6 +34,13 @@ def test_what_is_no_policy_for_a_robot(champion, tmp_path):
         for_robot(load(str(tmp_path / "alone"), BUNDLED))
     with pytest.raises(TandemError, match="made@1 is a set of skills of lsd; tandem robot needs primitives"):
         for_robot(made())
+
+
+@pytest.mark.parametrize("text", ["game: {bob_steps: 3}\n", "", "{}\n"])
+def test_what_is_no_log_of_a_robot(text, tmp_path):
+    (tmp_path / "log").write_text(text)
+    with pytest.raises(TandemError, match="is no log of tandem robot run, format 1; name what --log wrote"):
+        read_log(tmp_path / "log")
 
 
 def test_a_policy_of_a_users_task_plays_goals_of_the_nearest_kind(tmp_path):

@@ -6,7 +6,7 @@ import shutil
 import pytest
 import yaml
 
-from service.base.errors import CheckpointError, ConfigError, StorageError
+from service.base.errors import CheckpointError, ConfigError, StorageError, TandemError
 from service.base.lock import claim_epoch
 from service.registry.registry import Registry
 from service.runs import train as training
@@ -97,6 +97,21 @@ def test_a_hole_that_is_accepted_is_named_and_asked_about_once(run, tmp_path, mo
     assert first["damaged_records"] == list(said)
     assert second["changed"] == {"run.total_env_steps": [600, 700]}
     assert (second["damaged_records"], manifest.history["run"]) == ([], read_history(run).run)
+
+
+def test_a_task_is_no_name_of_a_run_of_self_play(run):
+    with pytest.raises(ConfigError) as error:
+        resumed_config(RunDirectory(run), ["task=wall", "method=ours"])
+    assert_one_line(error.value, "the run learns by self-play, not by ours")
+
+
+def test_a_file_is_no_run_directory(run, caplog):
+    directory = RunDirectory(run / "metrics.jsonl")
+    with pytest.raises(TandemError) as error:
+        directory.claim(resume=False)
+    directory.close()
+    assert_one_line(error.value, "metrics.jsonl is no directory; name another --run-dir")
+    assert caplog.messages == []  # nothing was lost
 
 
 def test_a_checkpoint_of_another_run_is_refused(run, tmp_path):
