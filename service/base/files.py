@@ -127,11 +127,16 @@ def write_exclusive(path: Path, data: bytes) -> bool:
 
 
 def check_place(path: Path) -> None:
-    """Check that a file can be written at ``path``, before the work whose result it is to hold; nothing stays there.
+    """Check that a file can be written at ``path``, before the work whose result it is to hold.
+
+    Its directory is made where it is missing.
 
     Raises:
         StorageError: it cannot.
     """
+    above = next(parent for parent in path.absolute().parents if os.path.exists(parent))
+    if not above.is_dir():
+        raise StorageError(f"cannot write {path}: {above} is no directory; name another place")
     with os_errors("write", path), _temporary(path, b"", flush=False):
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))

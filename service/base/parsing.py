@@ -102,7 +102,7 @@ def parse_yaml(text: str | bytes, where: object) -> Any:
     return tree
 
 
-EXPONENT = re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+")
+EXPONENT = re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+\Z")
 """Numbers such as 1e-3 and 3e6, which PyYAML reads as text, as YAML 1.1 says."""
 _TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
 

@@ -122,7 +122,8 @@ def run(origin: str, text: str) -> ModuleType:
     linecache.cache[origin] = (len(text), None, text.splitlines(keepends=True), origin)
     sys.modules[name] = module
     try:
-        with naming_errors_of(origin):
+        # stdout has what was asked of a command, such as JSON
+        with naming_errors_of(origin), contextlib.redirect_stdout(sys.stderr):
             exec(compile(text, origin, "exec", dont_inherit=True), vars(module))
     except BaseException:  # a second try is none of the half that ran
         del sys.modules[name]
@@ -132,10 +133,9 @@ def run(origin: str, text: str) -> ModuleType:
 
 @contextmanager
 def naming_errors_of(origin: str) -> Iterator[None]:
-    """Say of any error inside, in one line, where in the code of ``origin`` it comes from; it prints to stderr."""
+    """Say of any error inside, in one line, where in the code of ``origin`` it comes from."""
     try:
-        with contextlib.redirect_stdout(sys.stderr):  # stdout has what was asked for, such as JSON
-            yield
+        yield
     except CodeError:
         raise
     except (Exception, SystemExit) as error:

@@ -67,7 +67,8 @@ def demo(
     quiet: QuietOption = False,
 ) -> None:
     """Watch a robot arm teach itself: a small pre-training from scratch, live in the browser."""
-    paths = (Path("runs") / f"demo-{number}" for number in count(1))
+    runs = Path(os.environ.get("TANDEM_RUNS", "runs"))  # as tandem serve and tandem train have it
+    paths = (runs / f"demo-{number}" for number in count(1))
     path = run_dir or next(path for path in paths if not path.exists())
     if RunDirectory(path).exists:
         raise TandemError(

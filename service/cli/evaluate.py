@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import sys
+from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
@@ -127,13 +129,14 @@ def evaluate(
             f"--set: {trained.label} sees what it was trained to see, and {more} would be new or gone: leave "
             "world.observed as it is"
         )
-    rows = {
-        name: run(
-            player, world, tried,
-            num_episodes=episodes, num_steps=steps, seed=first_seed, success_distance_m=distance_m,
-        )
-        for name, player in players.items()
-    }  # fmt: skip
+    with redirect_stdout(sys.stderr):  # what functions of a task print is no result
+        rows = {
+            name: run(
+                player, world, tried,
+                num_episodes=episodes, num_steps=steps, seed=first_seed, success_distance_m=distance_m,
+            )
+            for name, player in players.items()
+        }  # fmt: skip
     if out is not None:
         _write_result(out, trained, method, seed, numbers_of(next(iter(rows.values()))))
     if as_json:
@@ -201,6 +204,7 @@ def coverage(
     quiet: QuietOption = False,
 ) -> None:
     """Plot where random compositions of the primitives, or random skills, move the object, beside a random policy."""
+    check_place(out)
     if out.suffix.lower() != ".png":
         raise TandemError(f"--out {out}: the picture is a PNG; name a file that ends in .png")
     reference, _ = what_is_meant(reference, primitives)
@@ -273,6 +277,7 @@ def film_options(size: str, camera: str, speed: float, out: Path) -> FilmOptions
     from service.media.video import FilmOptions
 
     check_format(out)
+    check_place(out)
     found = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", size)
     width, height = map(int, found.groups()) if found else (0, 0)
     if any(side % 2 or not _SIZES[0] <= side <= _SIZES[1] for side in (width, height)):

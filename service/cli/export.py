@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from service.base.files import check_place
 from service.cli.common import (
     REFERENCE,
     SOURCE,
@@ -96,6 +97,7 @@ def dataset(
         name = check_name(out)  # now, not after hours of playing
         if video is not None:
             check_format(video)
+            check_place(video)
         trained = load(players, registry).expect("primitives", "orchestrator", by="tandem dataset")
     trained.goal_kind  # noqa: B018 - what it plays is paid by distance alone
     config = trained.config.model_copy(update={"world": trained.world})

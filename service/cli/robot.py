@@ -147,6 +147,7 @@ def replay(
     from service.media.video import write_episode_video
     from service.robot.running import read_log
 
+    check_place(out)
     world, recorded = read_log(log)
     write_episode_video(recorded, world, out)
     typer.echo(f"video: {out}")

@@ -108,7 +108,7 @@ def train_study(
     where = source if is_service(source) else str(Path(source).absolute())
     options = ["--registry", where, *(part for tracker in trackers for part in ("--tracker", tracker))]
     runtime = "ray" if cluster is not None else "local"
-    typed = None if publish else publish  # it publishes its best run anyway
+    typed = False if publish is False else None  # a study publishes its best run by default
     hint = how_to_go_on(study.path, source, publish=typed, runtime=runtime, address=address)
     told = cluster() if cluster is not None else None  # reads the status service's token
     try:

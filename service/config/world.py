@@ -201,10 +201,10 @@ class WorldConfig(FrozenModel):
             raise ValueError("observed.obstacles, and no obstacles: describe some, or leave it out")
         ranges = self.randomisation.model_ranges
         lowest_m, smallest = (ranges.get(name, (usual,))[0] for name, usual in _LOWEST.items())
-        if lowest_m + smallest * min(self.rest_heights_m) < 0.0:
+        if lowest_m + (rest_m := smallest * min(self.rest_heights_m)) < 0.0:
             raise ValueError(
-                f"randomisation.table_height_m begins at {lowest_m:g}: the centre of an object would lie below z = 0, "
-                "where the workspace begins; let it begin higher"
+                f"randomisation.table_height_m begins at {lowest_m:g}: the smallest object's centre would lie below z = 0, "
+                f"where the workspace begins; let it begin at {-rest_m:g} or higher"
             )
         if (highest_m := max(self.rest_heights_m)) >= self.workspace.height_m:
             raise ValueError(

@@ -82,7 +82,8 @@ class Rules:
     def place(self, rng: np.random.Generator, worlds: slice = _ALL) -> None:
         """Put objects where the task has them start, in worlds that are at a random start; it may say nothing.
 
-        Where one is lower than it lies in its world, whose table and sizes may be drawn, all of the world are raised.
+        Where one is lower than it lies in its world, whose table and sizes may be drawn, all of the world are raised by
+        as much. What stands on another one is not moved by its size.
 
         Raises:
             CodeError: the function gives something else, or no places that are within reach and clear.

@@ -39,8 +39,9 @@ def take_over(
     for seen in inputs:
         old, new = getattr(before, seen), getattr(after, seen)
         if old.size == new.size and old.columns != new.columns:  # by their shapes the weights would fit
-            others = ", ".join(sorted(new.columns.keys() - old.columns.keys()))
-            return f"not taken, it has as many inputs as before and others: {others}"
+            return (
+                f"not taken, its inputs are {', '.join(new.columns)}, those of the trained one {', '.join(old.columns)}"
+            )
     own = network.state_dict()
     constants = {name for name, _ in network.named_buffers()}  # of the layout; a learner's state has none
     if missing := sorted((own.keys() ^ given.keys()) - constants):

@@ -82,7 +82,8 @@ def rate_of(results: Sequence[Mapping[str, Any]], key: str = "success_last") -> 
     mean = float(np.mean(rates))
     low, high = wilson_interval(round(mean * num), num)
     if len(rates) > 1:
-        low, high = min(low, seed_interval(rates)[0]), max(high, seed_interval(rates)[1])
+        least, greatest = seed_interval(rates)
+        low, high = min(low, least), max(high, greatest)
     return Rate(mean, low, high, len(rates))
 
 

@@ -32,7 +32,7 @@ class MujocoParameters(FrozenModel):
         "by the speed of the set-points, as the controllers of real arms do; for set-points without jumps",
     )
     joint_friction_nm: float = Field(0.0, ge=0.0, le=20.0, description="dry friction of the arm's joints")
-    object_mass_kg: float | None = Field(None, gt=0.0, le=2.0)
+    object_mass_kg: float | None = Field(None, gt=0.0, le=5.0)
     object_size_m: float | None = Field(None, ge=0.02, le=0.07)
     friction: float | None = Field(None, gt=0.0, le=3.0)
     pad_friction: float | None = Field(None, gt=0.0, le=3.0)

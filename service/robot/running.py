@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from service.base.errors import RobotError, TandemError
-from service.base.files import os_errors, read_regular
+from service.base.files import open_regular, os_errors
 from service.base.jsonl import JsonlWriter, read_jsonl
 from service.base.types import StateArray
 from service.config.frozen import first_error
@@ -153,9 +153,9 @@ def read_log(path: Path) -> tuple[WorldConfig, RecordedEpisodes]:
     Raises:
         TandemError: no such file, no log of a robot, or nothing was logged.
     """
-    with os_errors("read", path):
-        first = read_regular(path, follow=True).partition(b"\n")[0]
-    header, *rows = read_jsonl(path) if first.startswith(b"{") else [{}]
+    with os_errors("read", path), open_regular(path, follow=True) as file:
+        is_json = file.read(1) == b"{"
+    header, *rows = read_jsonl(path) if is_json else [{}]
     if header.get("format_version") != FORMAT_VERSION or not {"world", "success_distance_m"} <= header.keys():
         raise TandemError(f"{path} is no log of tandem robot run, format {FORMAT_VERSION}; name what --log wrote")
     try:

@@ -26,12 +26,12 @@ def resumed_config(directory: RunDirectory | Path, overrides: list[str], file: P
     """
     read = partial(load_config, directory) if isinstance(directory, Path) else directory.read_config
     saved = read()
-    tree: dict[str, Any] = {}
-    for override in overrides:
-        apply_override(tree, override)
     try:
         given = read(overrides) if file is None else load_config(file, overrides, saved.code)
     except ConfigError:
+        tree: dict[str, Any] = {}
+        for override in overrides:
+            apply_override(tree, override)
         if (method := tree.get("method", saved.method)) != saved.method:  # whose keys are others
             raise ConfigError(f"the run learns by {saved.method}, not by {method}: name that, or another run") from None
         raise

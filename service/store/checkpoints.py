@@ -65,10 +65,12 @@ class CheckpointStore:
         return files[-1][2] if files else None
 
     def _files(self) -> list[tuple[int, int, Path]]:
-        """Epoch, step and file of every checkpoint, the newest last."""
-        if not self.directory.is_dir():
+        """Epoch, step and file of every checkpoint, the newest last; none where the directory cannot be read."""
+        try:
+            entries = list(self.directory.iterdir())
+        except OSError:
             return []
-        matches = ((_FILE_PATTERN.fullmatch(entry.name), entry) for entry in self.directory.iterdir())
+        matches = ((_FILE_PATTERN.fullmatch(entry.name), entry) for entry in entries)
         return sorted((int(match[1] or 0), int(match[2]), entry) for match, entry in matches if match)
 
     def check_any(self) -> None:

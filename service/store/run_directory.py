@@ -352,7 +352,11 @@ class RunDirectory:
         if self._lock is not None:
             if self._events is None:  # it did not start
                 give_back_epoch(self.path, self.epoch)
-            self._lock.release(begun=self.exists)
+            try:
+                begun = self.exists
+            except OSError:  # the directory may not be read: nothing of it is removed
+                begun = True
+            self._lock.release(begun=begun)
             self._lock = None
             self.epoch = 0
         self._events = None

@@ -101,11 +101,13 @@ def test_a_place_that_cannot_be_written_is_known_before(tmp_path):
     files.check_place(tmp_path / "new" / "file")
     assert list((tmp_path / "new").iterdir()) == []
     (tmp_path / "file").write_text("whole")
-    for path, said in ((tmp_path, "Is a directory"), (tmp_path / "file" / "below", "File exists")):
+    for path, said in (
+        (tmp_path, "Is a directory; check the path and its permissions"),  # room on the disk would not help
+        (tmp_path / "file" / "below", f"{tmp_path / 'file'} is no directory; name another place"),
+    ):
         with pytest.raises(StorageError) as error:
             files.check_place(path)
-        # room on the disk would not help
-        assert_one_line(error.value, f"cannot write {path}: {said}; check the path and its permissions")
+        assert_one_line(error.value, f"cannot write {path}: {said}")
 
 
 # --- regular files ---------------------------------------------------------------------------------------------------

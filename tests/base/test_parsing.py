@@ -53,6 +53,11 @@ def test_yaml_with_aliases():
     assert parse_yaml(text, "a file") == {"base": base, "other": base | {"x": 2}, "again": base}
 
 
+def test_yaml_with_exponents():
+    text = "[1e-3, 3e6, -2.E+4, '1e5', 6e82ca6f, 1e5.npz, 2e2-cubes, e5]"
+    assert parse_yaml(text, "a file") == [0.001, 3e6, -2e4, "1e5", "6e82ca6f", "1e5.npz", "2e2-cubes", "e5"]
+
+
 def test_yaml_of_nothing():
     assert parse_yaml(b"# nothing\n", "a file") is None
 

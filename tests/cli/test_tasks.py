@@ -145,7 +145,7 @@ def test_what_learns_nothing_is_measured_as_a_run_is(tmp_path, monkeypatch):
     monkeypatch.setattr("service.actors.evaluation.evaluate", None)  # nothing is played
     for words, arguments in (
         ("o/idle.json is there already", ("--task", "push", "--method", "idle", "--out", "o/idle.json")),
-        ("File exists", ("--task", "push", "--method", "idle", "--out", "o/idle.json/x")),
+        ("idle.json is no directory", ("--task", "push", "--method", "idle", "--out", "o/idle.json/x")),
         ("--method is for a task", ("--method", "idle")),
         ("--out is for a task", ("--out", "x.json")),
         ("--method ours learns: tandem train", ("--task", "push", "--method", "ours")),

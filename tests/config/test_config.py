@@ -149,7 +149,10 @@ def test_overrides_beat_the_file_and_the_last_one_wins(tmp_path):
         ("world.observed.obstacles=true", ["observed.obstacles", "describe some"]),
         ("world.randomisation.friction=[1, 0.5]", ["friction = [1, 0.5] is the wrong way round"]),
         ("world.randomisation.delay_steps=[0, 20]", ["delay_steps = [0, 20] goes beyond [0, 8]"]),
-        ("world.randomisation.table_height_m=[-0.04, 0]", ["table_height_m begins at -0.04", "let it begin higher"]),
+        (
+            "world.randomisation.table_height_m=[-0.04, 0]",
+            ["table_height_m begins at -0.04", "let it begin at -0.025 or higher"],
+        ),
         ("world.randomisation.object_mass_kg=[0, 1]", ["object_mass_kg = [0, 1] goes beyond"]),
         (
             "world={fixture: wall, fixtures: [{shape: sphere, size_m: [0.05], position_m: [0, 0]}]}",

@@ -150,10 +150,10 @@ def no_room_above(num_bytes):
 def no_permission(path):
     """Nothing under ``path`` can be read or written, as where a mount is gone; root becomes another user for it."""
     before, user = path.stat().st_mode, os.geteuid()
-    path.chmod(0)
-    if user == 0:
-        os.seteuid(65534)
     try:
+        path.chmod(0)
+        if user == 0:
+            os.seteuid(65534)
         yield
     finally:
         os.seteuid(user)

@@ -10,6 +10,7 @@ from service.base.jsonl import Extent
 from service.base.lock import claim_epoch
 from service.config import load_config
 from service.store import run_directory
+from service.store.checkpoints import CheckpointStore
 from service.store.run_directory import Published, Resumption, RunDirectory
 from service.store.run_writer import RunWriter
 from tests.runs.runs import assert_one_line, no_permission, no_room_above, read_lines, tiny_config
@@ -234,5 +235,10 @@ def test_a_directory_that_may_not_be_read_for_a_while_ends_no_run(directory, cap
     assert "Permission denied" in caplog.text
     record(directory, 3)
     assert [row["iteration"] for row in read_lines(directory.metrics_file)] == [1, 2, 3]
-    with no_permission(directory.path):
-        directory.close()
+    claimed = RunDirectory(directory.path.parent / "claimed")
+    claimed.claim(resume=False)
+    claimed.start(tiny_config())
+    with no_permission(claimed.path):
+        assert CheckpointStore(claimed.checkpoints, keep=1).steps() == []
+        claimed.close()
+    assert claimed.exists
