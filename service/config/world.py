@@ -203,8 +203,8 @@ class WorldConfig(FrozenModel):
         lowest_m, smallest = (ranges.get(name, (usual,))[0] for name, usual in _LOWEST.items())
         if lowest_m + (rest_m := smallest * min(self.rest_heights_m)) < 0.0:
             raise ValueError(
-                f"randomisation.table_height_m begins at {lowest_m:g}: the smallest object's centre would lie below z = 0, "
-                f"where the workspace begins; let it begin at {-rest_m:g} or higher"
+                f"randomisation.table_height_m begins at {lowest_m:g}: the centre of the smallest object would lie "
+                f"below z = 0, where the workspace begins; let it begin at {-rest_m:g} or higher"
             )
         if (highest_m := max(self.rest_heights_m)) >= self.workspace.height_m:
             raise ValueError(

@@ -109,7 +109,7 @@ def test_names_in_addresses_are_services():
         assert port in container_ports(SERVICES[name]), (name, port)
 
 
-@pytest.mark.parametrize("name", ["head", "status"])
+@pytest.mark.parametrize("name", ["head", "worker", "gpu-worker", "status"])
 def test_who_writes_and_who_reads_have_the_same_files(name):
     assert SERVICES[name]["volumes"] == ["runs:/var/lib/tandem/runs", "registry:/var/lib/tandem/registry"]
 

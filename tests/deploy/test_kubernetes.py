@@ -186,7 +186,7 @@ def test_a_retried_job_goes_on_with_the_same_run():
     assert options["--registry"] == mounts[1]
 
 
-def test_the_status_service_reads_where_the_driver_writes():
+def test_the_status_service_reads_where_runs_are_written():
     def mounts(template):
         box = template["spec"]["containers"][0]
         claims = {each["name"]: each.get("persistentVolumeClaim") for each in template["spec"]["volumes"]}
@@ -200,7 +200,8 @@ def test_the_status_service_reads_where_the_driver_writes():
     status = mounts(manifest("Deployment", "status")["spec"]["template"])
     assert len(status) == 2
     for spec in ray_specs().values():
-        assert mounts(spec["headGroupSpec"]["template"]) == status
+        for group in (spec["headGroupSpec"], *spec["workerGroupSpecs"]):  # a study's runs are trained on workers
+            assert mounts(group["template"]) == status
     (claim,) = {claim for *_, claim in status}
     assert manifest("PersistentVolumeClaim", claim)["spec"]["accessModes"] == ["ReadWriteMany"]
 
