@@ -21,7 +21,7 @@ from typing import TypeVar
 
 from typing_extensions import override
 
-from service.base.errors import StoreUnavailableError, UnknownRunError
+from service.base.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError
 from service.store.address import RedisAddress, address_from_environment
 from service.store.disk_reader import DiskReader
 from service.store.models import ACTIVE, Columns, GoalGrid, Record, RunReader, RunStatus
@@ -64,13 +64,15 @@ class CombinedReader(RunReader):
 
     @override
     def run(self, run_id: str) -> RunStatus:
-        in_redis = self._ask_redis(lambda: self._redis.run(run_id))
         try:
-            return self._merge(self._disk.run(run_id), in_redis)
+            on_disk = self._disk.run(run_id)
         except UnknownRunError:
-            if in_redis is None:
+            if (in_redis := self._ask_redis(lambda: self._redis.run(run_id))) is None:
                 raise
             return in_redis
+        with suppress(DamagedStoreError):
+            return self._merge(on_disk, self._ask_redis(lambda: self._redis.run(run_id)))
+        return on_disk
 
     @override
     def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:

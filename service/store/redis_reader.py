@@ -30,11 +30,12 @@ class RedisReader(RunReader):
 
     @override
     def runs(self) -> list[RunStatus]:
-        """One with a damaged status is left out."""
+        """One with a damaged status is left out, and one without: it was removed."""
         statuses = []
-        for run_id, *values in self._look_up(self._run_ids()):
+        for run_id, text, *flags in self._look_up(self._run_ids()):
             try:
-                statuses.append(self._status(run_id, *values))
+                if text is not None:
+                    statuses.append(self._status(run_id, text, *flags))
             except DamagedStoreError as error:
                 _logger.warning("%s", error)
         return sorted(statuses, key=lambda status: status.started, reverse=True)

@@ -4,8 +4,9 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from service.base.errors import UnknownRunError
+from service.base.errors import DamagedStoreError, UnknownRunError
 from service.status.run_reader import RETRY_AFTER_S, CombinedReader, open_reader
+from service.store.address import run_key
 from service.store.disk_reader import DiskReader
 from service.store.redis_reader import RedisReader
 from tests.status.runs import append, grid, record, status, write_runs, write_status
@@ -53,6 +54,15 @@ def test_runs_of_both(reader):
 def test_a_directory_that_was_written_later(reader, root):
     write_status(root, "cube", iteration=9, heartbeat=datetime.now(UTC) + timedelta(minutes=1))
     assert reader.run("cube").iteration == 9
+
+
+def test_a_damaged_status_in_redis_does_not_hide_a_sound_directory(reader, redis):
+    redis.address.client(1.0).set(run_key("cube", "status"), b"torn")
+    assert reader.run("cube").iteration == 3
+    assert "cube" in [run.run_id for run in reader.runs()]
+    redis.address.client(1.0).set(run_key("far", "status"), b"torn")  # of another machine
+    with pytest.raises(DamagedStoreError):
+        reader.run("far")
 
 
 def test_metrics_and_goals_come_from_the_directory_where_there_is_one(reader, root):

@@ -227,7 +227,7 @@ def test_a_key_of_another_type_is_damage_or_what_redis_says(redis, reader, write
     client.rpush(run_key("other", "status"), 1)
     client.zadd(RUNS, {"other": 3.0})
     assert [run.run_id for run in reader.runs()] == ["cube"]
-    assert len(caplog.messages) == 3
+    assert caplog.messages == []  # they have no status: whoever removed a run left its name
     client.rpush(run_key("cube", "metrics"), 1)
     with pytest.raises(StoreUnavailableError, match="WRONGTYPE"):
         reader.metrics("cube")
