@@ -57,12 +57,14 @@ def test_a_directory_that_was_written_later(reader, root):
 
 
 def test_a_damaged_status_in_redis_does_not_hide_a_sound_directory(reader, redis):
-    redis.address.client(1.0).set(run_key("cube", "status"), b"torn")
+    client, keys = redis.address.client(1.0), [run_key(run_id, "status") for run_id in ("cube", "far")]
+    sound = client.mget(keys)
+    client.mset(dict.fromkeys(keys, b"torn"))
     assert reader.run("cube").iteration == 3
     assert "cube" in [run.run_id for run in reader.runs()]
-    redis.address.client(1.0).set(run_key("far", "status"), b"torn")  # of another machine
     with pytest.raises(DamagedStoreError):
-        reader.run("far")
+        reader.run("far")  # of another machine
+    client.mset(dict(zip(keys, sound, strict=True)))
 
 
 def test_metrics_and_goals_come_from_the_directory_where_there_is_one(reader, root):
