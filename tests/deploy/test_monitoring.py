@@ -185,6 +185,12 @@ def test_the_dashboard_shows_what_people_ask_for():
     }  # fmt: skip
 
 
+def test_what_is_now_is_not_what_was_within_the_last_hours():
+    targets = [target for panel in PANELS if panel["type"] == "stat" for target in panel["targets"]]
+    assert targets
+    assert all((target["instant"], target["range"]) == (True, False) for target in targets)
+
+
 def test_grafana_finds_dashboard_and_datasource():
     provisioning = DEPLOY / "grafana" / "provisioning"
     (provider,) = load(provisioning / "dashboards" / "tandem.yaml")["providers"]
