@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from service.registry.registry import Registry
-from service.store.models import ActorStatus
+from service.store.models import OUTPUT_FILE, ActorStatus
 from service.store.run_log import logging_to
 from tests.status.browser import CHROMIUM, Visit, chromium
 from tests.status.conftest import serve, write_home
@@ -174,6 +174,12 @@ def test_log_commands_and_configuration(visit, home):
         logging.getLogger("service.cluster").warning("rollout actor 3 is gone (killed); another takes its place")
     page = visit.go("#/runs/cube").page
     page.locator(".log .warning").get_by_text("rollout actor 3 is gone (killed)").wait_for()
+    assert page.get_by_text("What its processes wrote last").is_hidden()
+    (run / OUTPUT_FILE).write_text("first\n")
+    page.get_by_text("What its processes wrote last").click()
+    page.get_by_text("first", exact=True).wait_for()
+    (run / OUTPUT_FILE).write_text("first\nsecond\n")
+    page.locator("details[open] pre").get_by_text("second").wait_for()  # it stays open
     page.locator(".command").get_by_text(f"touch {run}/stop", exact=True).wait_for()
     assert page.get_by_text("/v1/runs/cube/stop").count() == 1
     page.get_by_label("Find a setting").fill("target_kl")
@@ -182,12 +188,15 @@ def test_log_commands_and_configuration(visit, home):
     page.locator(".command").get_by_text(f"tandem train --resume --run-dir {run} --registry").wait_for()
 
 
-def test_versions(visit):
+def test_versions(visit, home):
+    for name in ("panda-1", "panda-2"):
+        publish(Registry(home / "registry"), name)
     page = visit.go("#/primitives").page
     rows = page.get_by_role("table", name="Versions of tiny").locator("tbody tr")
     rows.first.wait_for()
     texts = [row.locator("td").all_inner_texts()[:3] for row in rows.all()]
     assert texts == [["tiny@2", "latest", f"50.0{NBSP}%"], ["tiny@1", "champion", f"50.0{NBSP}%"]]
+    assert page.get_by_role("region", name="panda-2").count() == 1  # each has a heading of its own
     with page.expect_download() as download:
         rows.first.get_by_role("link", name="parameters of tiny@2").click()
     assert download.value.suggested_filename == "tiny-2.safetensors"

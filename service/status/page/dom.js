@@ -1,6 +1,7 @@
 // Elements made by code. Text always becomes a text node, so that no name or message is read as markup.
 
 const SVG = "http://www.w3.org/2000/svg";
+let sections = 0;
 
 /** An element with attributes (null and false omit one) and children: nodes or text. */
 export function el(tag, attributes = {}, ...children) {
@@ -27,7 +28,7 @@ export function setText(element, text) {
 
 /** A part of a page: a heading and an empty body. */
 export function section(title, className = "") {
-  const id = `s-${title.toLowerCase().replace(/[^a-z]+/g, "-")}`;
+  const id = `section-${++sections}`;
   const body = el("div", { class: "body" });
   const root = el("section", { class: `card ${className}`, "aria-labelledby": id }, el("h2", { id }, title), body);
   return { root, body };

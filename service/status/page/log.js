@@ -1,12 +1,15 @@
 // What happened to a run: who died, who came back, how it ended.
 
-import { el, note } from "./dom.js";
+import { el, note, setText } from "./dom.js";
 import { counted } from "./format.js";
 import { age } from "./widgets.js";
 
 export class Log {
   constructor() {
-    this.root = el("div", {});
+    this.lines = el("div", {});
+    this.output = el("pre", {});
+    this.details = el("details", {}, el("summary", {}, "What its processes wrote last"), this.output);
+    this.root = el("div", {}, this.lines, this.details);
     this.shown = null;
   }
 
@@ -17,8 +20,9 @@ export class Log {
     this.shown = key;
     const lines = log.entries.toReversed().map((entry) => el("li", { class: entry.level }, age(entry.at), " ", el("span", {}, entry.text)));
     const more = log.num_entries > log.entries.length ? [note(`${counted(log.num_entries - log.entries.length, "earlier line")} not shown.`)] : [];
-    const output = log.output.length ? [el("details", {}, el("summary", {}, "What its processes wrote last"), el("pre", {}, log.output.join("\n")))] : [];
     const list = lines.length ? el("ol", { class: "log", tabindex: 0, "aria-label": "Log" }, ...lines) : note("Nothing yet. A run of an earlier version, or on another machine, keeps no log here.");
-    this.root.replaceChildren(list, ...more, ...output);
+    this.lines.replaceChildren(list, ...more);
+    setText(this.output, log.output.join("\n"));
+    this.details.hidden = !log.output.length;
   }
 }
