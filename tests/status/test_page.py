@@ -298,6 +298,8 @@ def test_the_runs_go_away_and_come_back(visit, home, place):
     page.get_by_role("table").first.wait_for()
     (home / "runs").rename(home / "elsewhere")
     page.locator("#banner").get_by_text(str(home / "runs")).wait_for()
+    visit.go("#/no/view").page.locator("#banner").wait_for(state="hidden")  # which asks for no runs
+    visit.go(place).page.locator("#banner").get_by_text(str(home / "runs")).wait_for()
     (home / "elsewhere").rename(home / "runs")
     write_status(home / "runs", "cube", iteration=4)
     page.locator("#banner").wait_for(state="hidden")

@@ -167,11 +167,48 @@ def test_many_runs_are_asked_for_in_questions_that_every_proxy_takes(visit):
 def test_what_is_wrong_with_a_question_is_said_where_runs_are_compared(visit):
     page = visit.page
     page.route("**/v1/series?*", lambda route: route.fulfill(status=414, body="<html>"))
-    visit.go("#/compare/cube,old")
+    page.route("**/v1/runs?*", lambda route: route.fulfill(status=500, json={"detail": "it broke"}))
+    visit.go("#/compare/cube,old").page.get_by_text("It broke.").wait_for()
+    page.unroute("**/v1/runs?*")
     page.get_by_text("the service answers 414").wait_for()
     page.unroute("**/v1/series?*")
     visit.points("bob/success_rate", 3)
     assert page.get_by_text("the service answers 414").count() == 0
+
+
+def test_the_curves_of_a_run_that_has_ended_come_after_all(visit):
+    page = visit.page
+    page.route("**/v1/series?*", lambda route: route.fulfill(status=500, json={"detail": "it broke"}))
+    visit.go("#/runs/old").page.get_by_text("This run cannot be followed: It broke.").wait_for()
+    page.unroute("**/v1/series?*")
+    visit.points("bob/success_rate", 3, "old")
+    assert page.get_by_text("This run cannot be followed").count() == 0
+
+
+def test_the_newest_runs_are_not_all_there_are(visit):
+    page = visit.page
+    page.route("**/v1/runs?*", lambda route: route.fulfill(json={"runs": [], "num_runs": 1001}))
+    page.route("**/v1/runs/nope", lambda route: route.fulfill(status=404, json={"detail": "no run"}))
+    states = visit.go("#/compare/cube,old,nope").page.get_by_role("table", name="Compared runs").locator(".chip")
+    states.first.wait_for()
+    assert states.all_inner_texts() == ["running", "finished", "not there"]
+    for each in ("**/v1/runs?*", "**/v1/runs/nope"):
+        page.unroute(each)
+
+
+def test_the_newest_value_is_that_of_the_whole_run(visit):
+    newest = visit.go("#/no/view").page.evaluate(
+        """async () => {
+            const { Board } = await import('/page/board.js')
+            const panel = { title: '', hint: '', curves: [['bob/success_rate', '']] }
+            const board = new Board([{ id: 'cube' }], [panel], new AbortController().signal)
+            await board.refresh()
+            board.range = [0, 1000]
+            await board.refresh()
+            return [board.data, board.unzoomed].map(data => data.get('cube').curves['bob/success_rate'].mean.at(-1))
+        }"""
+    )
+    assert newest == [0.25, 0.375]
 
 
 def test_a_missing_value_is_a_gap_and_a_new_one_is_drawn(visit, home):

@@ -109,6 +109,12 @@ export function troubled(about, message) {
   show();
 }
 
+/** Forget what a view that is left could not read: nobody asks for it again. */
+export function leave() {
+  for (const about of [...troubles.keys()]) if (about !== "network") troubles.delete(about);
+  show();
+}
+
 function show() {
   const banner = document.getElementById("banner");
   const text = troubles.get("network") ?? [...troubles.values()].join(" ");

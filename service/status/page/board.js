@@ -21,7 +21,7 @@ let boards = 0;
 export class Board {
   /** ``runs`` are {id, label, study}; ``panels`` those that are always there; ``banded``: whether seeds may be a band. */
   constructor(runs, panels, signal) {
-    Object.assign(this, { runs, signal, data: new Map(), names: [], cursor: null, range: null });
+    Object.assign(this, { runs, signal, data: new Map(), unzoomed: new Map(), names: [], cursor: null, range: null });
     Object.assign(this, { axis: "env_steps", place: null, log: false, banded: false, pending: false, asked: 0 });
     this.number = ++boards;
     this.panels = panels.map((spec) => new Panel(spec, this));
@@ -96,6 +96,7 @@ export class Board {
         this.data.set(run.run_id, known ? { ...run, curves: { ...known.curves, ...run.curves } } : run);
       }
     }
+    if (!this.range) this.unzoomed = this.data; // which has the newest values
     this.learn();
     const stamp = JSON.stringify([this.axis, this.range, names, [...this.data.values()].map((run) => [run.run_id, run.last_iteration, run.x.length, run.problem])]);
     if (stamp === this.stamp) return; // ended runs are asked for again and again

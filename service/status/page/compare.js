@@ -3,21 +3,22 @@
 import { ApiError, get, sentence } from "./api.js";
 import { Board } from "./board.js";
 import { differences } from "./config.js";
-import { el, note, runLink, section } from "./dom.js";
-import { every, isActive } from "./follow.js";
+import { el, note, runLink, section, setText } from "./dom.js";
+import { every, isActive, sleep, visible } from "./follow.js";
 import { count, counted, percent } from "./format.js";
 import { NUM_COLOURS } from "./library.js";
 import { comparedPanels } from "./metrics.js";
 import { stateChip, Table, trialText } from "./widgets.js";
 
 const EVERY_MS = 5000;
+const LIMIT = 1000;
 const SUCCESS = ["bob/success_rate", "evaluation/success_last"];
 
 /** Compare the runs with these ids until ``signal`` aborts. */
 export async function compareView(root, ids, signal) {
   document.title = `${counted(ids.length, "run")} \u00b7 Tandem`;
   root.replaceChildren(el("h1", {}, counted(ids.length, "run")), note("Asking \u2026"));
-  const statuses = await asked(root, signal);
+  const statuses = await asked(root, ids, signal);
   if (!statuses) return;
   const runs = ids.map((id) => ({ id, label: id, study: studyOf(statuses.get(id)), hidden: false }));
   const board = new Board(runs, comparedPanels(ids.map((id) => statuses.get(id)).filter(Boolean)), signal);
@@ -30,8 +31,7 @@ export async function compareView(root, ids, signal) {
   compareConfigurations(setups.body, ids, signal);
   await every(EVERY_MS, signal, async () => {
     await board.refresh().catch((error) => board.fail(error));
-    const found = await get(["v1", "runs"], [["limit", 1000]], signal);
-    show(new Map(found.runs.map((run) => [run.run_id, run])));
+    show(await statusesOf(ids, signal));
   });
 }
 
@@ -40,18 +40,44 @@ function studyOf(run) {
   return run?.study ?? (run?.trial ? trialText({ ...run.trial, seed: null }) : null);
 }
 
-async function asked(root, signal) {
+/** Ask for the runs until there is an answer; null if the view is left before. */
+async function asked(root, ids, signal) {
+  const trouble = note();
+  while (!signal.aborted) {
+    await visible(signal);
+    try {
+      return await statusesOf(ids, signal);
+    } catch (error) {
+      if (signal.aborted) return null;
+      setText(trouble, error instanceof ApiError ? sentence(error.message) : String(error));
+      root.append(trouble);
+    }
+    await sleep(EVERY_MS, signal);
+  }
+  return null;
+}
+
+/** The runs with these ids, by their ids, without those that are not there. */
+async function statusesOf(ids, signal) {
+  const { runs, num_runs: numRuns } = await get(["v1", "runs"], [["limit", LIMIT]], signal);
+  const newest = new Map(runs.map((run) => [run.run_id, run]));
+  const older = numRuns > runs.length ? ids.filter((id) => !newest.has(id)) : [];
+  const found = await Promise.all(older.map((id) => statusOf(id, signal)));
+  return new Map([...newest, ...found.filter(Boolean).map((run) => [run.run_id, run])]);
+}
+
+/** One run; null if it is not there. */
+async function statusOf(id, signal) {
   try {
-    const { runs } = await get(["v1", "runs"], [["limit", 1000]], signal);
-    return new Map(runs.map((run) => [run.run_id, run]));
+    return await get(["v1", "runs", id], [], signal);
   } catch (error) {
-    if (!signal.aborted) root.append(note(error instanceof ApiError ? sentence(error.message) : String(error)));
-    return null;
+    if ([404, 422].includes(error.status)) return null;
+    throw error;
   }
 }
 
 function newest(board, id) {
-  const curves = board.data.get(id)?.curves ?? {};
+  const curves = board.unzoomed.get(id)?.curves ?? {};
   return SUCCESS.map((name) => curves[name]?.mean.findLast((value) => value !== null)).find(Number.isFinite);
 }
 

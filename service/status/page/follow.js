@@ -78,7 +78,7 @@ function listen(run, listener, signal) {
 }
 
 /** Resolve after some time, or when the view is left. */
-function sleep(milliseconds, signal) {
+export function sleep(milliseconds, signal) {
   return new Promise((resolve) => {
     if (signal.aborted) return resolve();
     const timer = setTimeout(done, milliseconds);
@@ -92,7 +92,7 @@ function sleep(milliseconds, signal) {
 }
 
 /** Resolve when the page is visible: a tab in the background makes no requests. */
-async function visible(signal) {
+export async function visible(signal) {
   while (document.hidden && !signal.aborted) {
     await new Promise((resolve) => {
       const options = { once: true };

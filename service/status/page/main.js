@@ -1,7 +1,7 @@
 // Show the view of the address: #/ has all runs, #/runs/ID one run, #/compare/ID,ID several, #/tasks the table of
 // downstream tasks, #/primitives the registry.
 
-import { connection, get } from "./api.js";
+import { connection, get, leave } from "./api.js";
 import { el, note } from "./dom.js";
 import { every } from "./follow.js";
 import { library } from "./library.js";
@@ -15,6 +15,7 @@ let left = new AbortController();
 
 function show() {
   left.abort();
+  leave();
   left = new AbortController();
   const parts = location.hash.replace(/^#\/?/, "").split("/").map(decoded);
   const [page, id] = parts;

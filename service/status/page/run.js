@@ -81,6 +81,7 @@ class RunPage {
     this.run = run;
     if (!this.begun) this.begin(run);
     this.summary.update(run);
+    if (this.missed) this.curves(); // of a run that has ended nothing else asks again
     if (this.setup) this.commands.update(run, this.setup);
     if (!this.actorsBody) return;
     this.actors.update(run);
@@ -99,11 +100,13 @@ class RunPage {
       do {
         this.again = false;
         await this.board.refresh();
+        this.missed = false;
         this.summary.trouble(null);
-        this.summary.success(this.board.data.get(this.runId)?.curves[BOB]?.mean.findLast((value) => value !== null));
+        this.summary.success(this.board.unzoomed.get(this.runId)?.curves[BOB]?.mean.findLast((value) => value !== null));
         await new Promise((resolve) => setTimeout(resolve, CURVES_MS));
       } while (this.again && !this.signal.aborted);
     } catch (error) {
+      this.missed = true;
       this.failed(error);
     } finally {
       this.asking = false;
