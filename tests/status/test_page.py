@@ -259,6 +259,14 @@ def test_the_list_of_runs_is_updated_live(visit, home):
     page.get_by_text(f"5,000 of 10{NBSP}k").wait_for()
     assert page.locator("tbody .chip.warn").all_inner_texts() == ["disk"]
     assert page.evaluate("document.activeElement.textContent") == "cube"  # a keyboard does not lose its place
+    page.get_by_label("Choose cube").press("Space")
+    page.get_by_role("button", name="Choose all shown").press("Space")
+    page.get_by_role("link", name="Compare 3 runs").wait_for()
+    assert page.locator("tbody input:checked").count() == 3
+    page.get_by_label("Choose another").press("Space")
+    write_status(home / "runs", "another", num_env_steps=6000)
+    page.get_by_text(f"6,000 of 10{NBSP}k").wait_for()
+    assert page.evaluate("document.activeElement.ariaLabel") == "Choose another"
 
 
 def restart(shared):

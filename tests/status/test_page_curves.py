@@ -103,8 +103,11 @@ def test_a_long_run_is_thinned_smoothed_and_asked_for_anew(visit):
     assert 1_100_000 < zoomed["x"][0] < 1_234_000 < zoomed["x"][-1] < 1_350_000
     page.get_by_role("button", name="Whole run").click()
     visit.points("learner/kl", 1000, "long")
+    page.locator("summary").filter(has_text="learner").click()
     page.get_by_label("logarithmic").check()
     visit.wait("document.querySelectorAll('.canvas')[0]._fullLayout.yaxis.type === 'log'")
+    page.locator("summary").filter(has_text="learner").click()  # also what was closed meanwhile
+    visit.wait("document.querySelector('.groups details[open] .canvas')._fullLayout.yaxis.type === 'log'")
     # all of it as CSV, and a picture
     with page.expect_download() as table:
         panel.get_by_role("link", name="CSV").click()
@@ -117,6 +120,9 @@ def test_a_long_run_is_thinned_smoothed_and_asked_for_anew(visit):
     page.get_by_label("Find a metric").fill("idle")
     assert page.locator("summary").filter(has_text="time").count() == 1
     visit.points("time/learner_idle_fraction", 1000, "long")
+    page.evaluate("window.left = document.querySelector('.groups .canvas')")
+    page.get_by_label("Find a metric").fill("none has this")
+    visit.wait("!left.isConnected && !left._fullLayout")  # the library keeps nothing of it
     assert [said for said in visit.complaints if "404" not in said] == []  # this run has no goals
 
 
@@ -161,6 +167,7 @@ def test_many_runs_are_asked_for_in_questions_that_every_proxy_takes(visit):
     page.get_by_text(f"no run '{ids[-1]}'").wait_for()
     questions = [url for url in visit.asked if "/v1/series?" in url]
     assert max(map(len, questions)) < 6000
+    assert page.locator("figure.chart").get_by_role("link", name="CSV").count() == 0  # which is one question
     assert {id_ for url in questions for id_ in parse_qs(urlsplit(url).query)["runs"]} == set(ids)
 
 

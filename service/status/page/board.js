@@ -1,7 +1,7 @@
 // All curves of one run or of several: which panels there are, their data, and what they share: axis, smoothing, zoom, cursor.
 
 import { address, get } from "./api.js";
-import { el, note, setText } from "./dom.js";
+import { el, mark, note, setText } from "./dom.js";
 import { counted } from "./format.js";
 import { library, onTheme } from "./library.js";
 import { grouped, panelsOf } from "./metrics.js";
@@ -32,7 +32,10 @@ export class Board {
     this.root = el("div", { class: "board" }, this.controls(), this.trouble, this.overview, this.groups);
     library().catch((error) => this.fail(error));
     onTheme(() => this.draw(), signal);
-    signal.addEventListener("abort", () => this.shown().forEach((panel) => panel.close()));
+    signal.addEventListener("abort", () => {
+      this.panels.forEach((panel) => panel.close());
+      for (const group of this.opened.keys()) this.drop(group);
+    });
   }
 
   controls() {
@@ -130,7 +133,7 @@ export class Board {
     const wanted = this.filter.value.trim().toLowerCase();
     const groups = grouped(this.names.filter((name) => name.toLowerCase().includes(wanted)));
     const parts = [...groups].map(([group, names]) => this.part(group, names, Boolean(wanted)));
-    for (const group of this.opened.keys()) if (!groups.has(group)) this.opened.delete(group);
+    for (const group of this.opened.keys()) if (!groups.has(group)) this.drop(group);
     this.groups.replaceChildren(...parts, ...(wanted && !parts.length ? [note("No metric has this in its name.")] : []));
     if (wanted) this.refresh().catch((error) => this.fail(error));
   }
@@ -141,13 +144,23 @@ export class Board {
       if (open) known.details.open = true;
       return known.details;
     }
+    this.drop(group);
     const body = el("div", { class: "charts" });
     const details = el("details", { open: open || known?.details.open }, el("summary", {}, group, " ", el("small", {}, counted(names.length, "metric"))), body);
     const panels = panelsOf(names).map((spec) => new Panel(spec, this));
     body.append(...panels.map((panel) => panel.root));
-    details.addEventListener("toggle", () => details.open && this.refresh().catch((error) => this.fail(error)));
+    details.addEventListener("toggle", () => {
+      this.stamp = null; // settings may have changed while it was closed
+      if (details.open) this.refresh().catch((error) => this.fail(error));
+    });
     this.opened.set(group, { details, panels, names: names.join() });
     return details;
+  }
+
+  /** Forget a group, and what the library keeps of its panels. */
+  drop(group) {
+    this.opened.get(group)?.panels.forEach((panel) => panel.close());
+    this.opened.delete(group);
   }
 
   /** Show a part of the axis, asked for anew; null for all of it. */
@@ -197,12 +210,14 @@ export class Board {
     } catch (error) {
       this.fail(error);
     }
-    requestAnimationFrame(() => performance.mark("curves"));
+    requestAnimationFrame(() => mark("curves"));
   }
 
-  /** The URL of all values of some metrics. */
+  /** The URL of all values of some metrics; null if it were too long for the service or a proxy. */
   tableUrl(names) {
-    const query = [...this.runs.map((run) => ["runs", run.id]), ...names.map((name) => ["names", name])];
+    const runs = split("runs", this.runs.map((run) => run.id), MAX_RUNS);
+    if (runs.length > 1) return null;
+    const query = [...runs.flat(), ...names.map((name) => ["names", name])];
     return `${address("v1", "series.csv")}?${new URLSearchParams(query)}`;
   }
 

@@ -89,7 +89,7 @@ async function compareConfigurations(body, ids, signal) {
 
 function runTable(board) {
   const columns = [
-    { label: "Run", changed: ({ id, hidden }) => [id, hidden], node: ({ run }) => chooser(run, board) },
+    { label: "Run", changed: ({ id }) => id, node: ({ run }) => chooser(run, board) },
     { label: "State", changed: ({ status }) => [status?.state, status?.stopping], node: ({ status }) => (status ? stateChip(status) : el("span", { class: "chip lost" }, "not there")) },
     { label: "Study or task", text: ({ study }) => study ?? "\u2013" },
     { label: "Env steps", text: ({ status }) => count(status?.num_env_steps), number: true },

@@ -39,6 +39,12 @@ export function note(...content) {
   return el("p", { class: "note" }, ...content);
 }
 
+/** Record when something was shown; the last time counts. */
+export function mark(name) {
+  performance.clearMarks(name);
+  performance.mark(name);
+}
+
 /** A link to a run. */
 export function runLink(runId, text = runId) {
   return el("a", { href: `#/runs/${encodeURIComponent(runId)}` }, text);

@@ -26,7 +26,8 @@ export class Panel {
     const picture = el("button", { type: "button", "aria-label": `Picture of ${spec.title}` }, "PNG");
     picture.addEventListener("click", () => this.save());
     const label = `All values of ${spec.title}, as CSV`;
-    const table = el("a", { href: board.tableUrl(this.names), download: "metrics.csv", "aria-label": label }, "CSV");
+    const url = board.tableUrl(this.names);
+    const table = url && el("a", { href: url, download: "metrics.csv", "aria-label": label }, "CSV");
     const head = el("figcaption", {}, el("h3", {}, spec.title), this.where, el("span", { class: "tools" }, picture, table));
     this.root = el("figure", { class: "chart" }, head, el("span", { class: "hint" }, spec.hint), this.plot, this.legend);
     this.listen();

@@ -1,7 +1,7 @@
 // The page of all runs, with a small curve of success for each: search, filter, sort, and choose some to compare.
 
 import { ApiError, get, sentence } from "./api.js";
-import { el, note, runLink, setText, svg } from "./dom.js";
+import { el, mark, note, runLink, setText, svg } from "./dom.js";
 import { every, isActive } from "./follow.js";
 import { count, counted, percent } from "./format.js";
 import { age, progressBar, share, stateChip, Table, trialText } from "./widgets.js";
@@ -57,7 +57,7 @@ class RunsPage {
         return;
       }
       this.show();
-      requestAnimationFrame(() => performance.mark("runs"));
+      requestAnimationFrame(() => mark("runs"));
     });
   }
 
@@ -93,7 +93,8 @@ class RunsPage {
     const ids = this.shown.map((run) => run.run_id);
     const on = ids.some((id) => !this.chosen.has(id));
     ids.forEach((id) => (on ? this.chosen.add(id) : this.chosen.delete(id)));
-    this.show();
+    for (const box of this.table.root.querySelectorAll("input")) box.checked = on; // the table has those shown alone
+    this.offer();
   }
 
   offer() {
@@ -111,7 +112,7 @@ function choice(label, options) {
 
 function columns(page) {
   return [
-    { label: "Run", changed: (run) => [run.run_id, run.name, run.runtime, page.chosen.has(run.run_id)], node: (run) => title(run, page) },
+    { label: "Run", changed: (run) => [run.run_id, run.name, run.runtime], node: (run) => title(run, page) },
     { label: "State", changed: (run) => [run.state, run.condition, run.stopping, run.last_error, run.warnings], node: state },
     { label: "Env steps", changed: (run) => [run.num_env_steps, run.total_env_steps], node: progressBar },
     { label: "Env steps/s", text: (run) => (isActive(run) ? count(run.env_steps_per_s) : "\u2013"), number: true },
