@@ -102,7 +102,8 @@ class RunPage {
         await this.board.refresh();
         this.missed = false;
         this.summary.trouble(null);
-        this.summary.success(this.board.unzoomed.get(this.runId)?.curves[BOB]?.mean.findLast((value) => value !== null));
+        const curve = this.board.unzoomed.get(this.runId)?.curves[BOB];
+        this.summary.success(curve?.mean.findLast((value) => value !== null));
         await new Promise((resolve) => setTimeout(resolve, CURVES_MS));
       } while (this.again && !this.signal.aborted);
     } catch (error) {
