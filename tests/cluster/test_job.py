@@ -117,7 +117,8 @@ def test_a_study_of_tasks_is_killed_with_its_driver_and_stopped_and_goes_on(head
     def wait_until_each_goes_on(process, epoch):
         def goes_on():
             known = statuses()
-            return len(known) == 2 and all(each["epoch"] == epoch and each["iteration"] >= 2 for each in known)
+            running = [each for each in known if each["state"] == "running" and each["epoch"] == epoch]
+            return len(running) == 2 and all(each["iteration"] >= 2 for each in running)
 
         wait_for(lambda: process.poll() is not None or (goes_on() and min(steps_saved()) >= 2))
         assert process.poll() is None, process.stdout.read()

@@ -196,7 +196,13 @@ def test_one_is_stopped_over_rest_and_resumed_by_its_directory_alone(tmp_path, t
 
         def stop_after(process, iteration):
             """Stop it once it is so far, and give its status then."""
-            wait_until(lambda: client.get("/v1/runs/wall").is_success and ask()["iteration"] >= iteration)
+            wait_until(
+                lambda: (
+                    client.get("/v1/runs/wall").is_success
+                    and (now := ask())["state"] == "running"
+                    and now["iteration"] >= iteration
+                )
+            )
             assert client.post("/v1/runs/wall/stop").json()["stopping"]
             assert process.wait(300) == 0
             return ask()
