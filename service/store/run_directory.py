@@ -325,12 +325,13 @@ class RunDirectory:
             return
         states, actions = zip(*diverged, strict=True)
         path, data = self.diverged / f"round-{name}.npz", io.BytesIO()
-        np.savez(data, states=np.stack(states), actions=np.stack(actions))
-        _logger.warning("physics diverged in %d worlds, which go on from sound states; see %s", len(states), path)
         with self.keep_running(self.diverged), os_errors("write", self.diverged):
             self.diverged.mkdir(exist_ok=True)
-            if len(list(self.diverged.iterdir())) < MAX_DIVERGED_FILES:
-                write_atomic(path, data.getvalue())
+            if len(list(self.diverged.iterdir())) >= MAX_DIVERGED_FILES:
+                return
+            _logger.warning("physics diverged in %d worlds, which go on from sound states; see %s", len(states), path)
+            np.savez(data, states=np.stack(states), actions=np.stack(actions))
+            write_atomic(path, data.getvalue())
 
     def sync(self) -> dict[str, Extent]:
         """Wait until the disk has every record, and say what there is: a checkpoint must not know more than they do."""
