@@ -134,7 +134,7 @@ def make_env(task: str | Task | None = None, trained: Trained | None = None, *, 
     """N worlds of a task as one Gymnasium vector environment; ``gymnasium.make`` has single ones.
 
     Args:
-        task: by name or file, or an object; None: goals anywhere.
+        task: by name or file, or an object; None: goals in the volume and on the table (beside a fixture: on the table).
         trained: in whose world it is; None: the paper's.
         num_envs: N.
     """

@@ -244,7 +244,10 @@ class Appender:
                 self._check_same(file)
                 while self._waiting:
                     _write_whole(file, self._waiting[0])
-                    self._waiting.popleft()
+                    self._written(self._waiting.popleft())
+
+    def _written(self, piece: bytes) -> None:
+        """Called when the file has one more piece."""
 
     def _check_same(self, file: FileIO) -> None:
         there = os.fstat(file.fileno())

@@ -68,7 +68,7 @@ class JsonlWriter(Appender):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self.extent = Extent()
-        """Of what was appended, or kept by a cut."""
+        """Of what the file has got, or was kept by a cut; not of what waits for room."""
 
     def append(self, record: Mapping[str, Any]) -> None:
         """Write ``record``, made `plain`, as the file's last line and hand it to the operating system.
@@ -76,9 +76,7 @@ class JsonlWriter(Appender):
         Raises:
             StorageError: the disk is full or the file cannot be written; the record waits, see `append_bytes`.
         """
-        line = json.dumps(plain(record), allow_nan=False).encode() + b"\n"
-        self.extent = Extent(self.extent.num_bytes + len(line), zlib.crc32(line, self.extent.crc32))
-        self.append_bytes(line)
+        self.append_bytes(json.dumps(plain(record), allow_nan=False).encode() + b"\n")
 
     def damage(self, extent: Extent) -> str | None:
         """Compare the beginning of the file with what it once was: what is wrong with it, or None.
@@ -119,6 +117,9 @@ class JsonlWriter(Appender):
         if num_strange:
             _logger.warning("%s: left out %d lines that are no records in their order", self.path, num_strange)
         self._replace(b"".join(line + b"\n" for line in kept))
+
+    def _written(self, piece: bytes) -> None:
+        self.extent = Extent(self.extent.num_bytes + len(piece), zlib.crc32(piece, self.extent.crc32))
 
     def _replace(self, kept: bytes) -> None:
         self.extent = Extent.of(kept)

@@ -81,7 +81,7 @@ ReferenceArgument = Annotated[
 ActsWithOption = Annotated[
     str | None,
     typer.Option(
-        "--primitives", metavar=REFERENCE, help="What a policy of a task acts with, where that has moved since then."
+        "--primitives", metavar=REFERENCE, help="New place of the primitives or skills that a task's policy uses, if they moved."
     ),
 ]
 TaskOption = Annotated[

@@ -90,7 +90,7 @@ def evaluate(
 ) -> None:
     """Measure on random goals, from fresh resets and without noise, beside a policy that does nothing.
 
-    Of skills (LSD, METRA, DIAYN) the one that leads to the goal acts. A policy of a task plays its task, beside its Bob
+    Of skills (all but DADS) the one that leads to the goal acts. A policy of a task plays its task, beside its Bob
     alone; with the seed of its run, the goals are those of its result.
     """
     for override in overrides or ():

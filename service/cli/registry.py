@@ -45,7 +45,7 @@ def publish(
     name: Annotated[str | None, typer.Option(help="Of what is published. Default: that of the run.")] = None,
     alias: Annotated[str | None, typer.Option(help="Make or move this alias, too.")] = None,
     primitives: ActsWithOption = None,
-    registry: SourceOption = SOURCE,
+    registry: RegistryOption = REGISTRY,
     quiet: QuietOption = False,
 ) -> None:
     """Measure what a run has learned until now, and publish it: primitives, skills or a policy of a task."""
@@ -56,7 +56,7 @@ def publish(
         check_alias(alias)
     version = publish_learned(run, registry, name, primitives)
     if alias is not None:
-        Registry(Path(registry)).set_alias(version.name, alias, version.number)
+        Registry(registry).set_alias(version.name, alias, version.number)
     typer.echo(f"{version} is in {registry}")
 
 

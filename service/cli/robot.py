@@ -31,7 +31,7 @@ robot_app = typer.Typer(name="robot", help="Frozen policies on a robot.", cls=Co
 
 _Policy = Annotated[
     str,
-    typer.Option(metavar=REFERENCE, help="Whose Bob; or an orchestrator, published or in its training."),
+    typer.Option(metavar=REFERENCE, help="Primitives or an orchestrator: a version, a run or an export."),
 ]
 _Robot = Annotated[
     str, typer.Option(metavar="NAME|FILE", help="mujoco, pybullet, franka, module:function, or a YAML file.")

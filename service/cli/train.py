@@ -68,13 +68,13 @@ def train(
         typer.Argument(
             metavar="RECIPE|TASK|FILE|all",
             autocompletion=targets,
-            help="A name of tandem configs, a task such as push or of yours in FILE.py, or a YAML file; what it leaves "
+            help="A recipe, a task such as push or of yours in FILE.py, or a YAML file; what it leaves "
             "out has its default. "
             f"Without: {DEFAULT_RECIPE}, or what a resumed run has. Several, such as push,wall, or all: a study.",
         ),
     ] = None,
     config: Annotated[
-        str | None, typer.Option(metavar="NAME|FILE", autocompletion=targets, help="The same as an option.")
+        str | None, typer.Option(metavar="NAME|FILE", autocompletion=targets, help="Recipe or file, given as an option.")
     ] = None,
     method: Annotated[
         str | None,
@@ -106,7 +106,7 @@ def train(
     ] = None,
     grid: Annotated[
         list[str] | None,
-        typer.Option(metavar="A.B=C,D", help="A study: a run for each value of a key; repeatable, for each with each."),
+        typer.Option(metavar="A.B=C,D", help="A study: a run for each value of a key; repeatable: then a run for each combination."),
     ] = None,
     parallel: Annotated[
         int | None, typer.Option(help="Runs of a study at once; default: as many as there are cores for.", min=1)

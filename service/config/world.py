@@ -34,7 +34,7 @@ _LOWEST = {"table_height_m": 0.0, "object_size": 1.0}
 
 
 class WorkspaceConfig(FrozenModel):
-    """The box in which goals are valid. Origin of the world: the table top, 0.6 m in front of the robot's base."""
+    """The box in which goals are valid. Origin of the world: the table top, in front of the robot's base (of the Panda 0.6 m)."""
 
     center_x_m: float = Field(-0.05, ge=-0.3, le=0.2, description="-0.05 keeps the downstream Larger task reachable")
     center_y_m: float = Field(0.0, ge=-0.3, le=0.3)
@@ -65,8 +65,8 @@ class ObservedConfig(FrozenModel):
     )
     delay: bool = Field(
         False,
-        description="policies see by how many control steps their commands are late; tandem robot run tells them by "
-        "how many what is seen is late",
+        description="policies see by how many control steps their commands are late; tandem robot run gives them the "
+        "delay of the observation instead",
     )
     obstacles: bool = Field(False, description="whether policies see where the middle of each of world.obstacles is")
 

@@ -130,8 +130,8 @@ def train(
         start: what a new run begins from (``service.load``); a resumed one has begun already.
 
     Raises:
-        TandemError: see ``Run`` and ``RunDirectory.start``; or a registry that is only read; or a Redis that is
-            configured and cannot be used; or a method that the runtime does not have.
+        TandemError: see ``Run`` and ``RunDirectory.start``; or a registry that is only read; or of a new run a Redis
+            that is configured and cannot be used; or a method that the runtime does not have.
         UnfinishedError: everything is saved, and not published.
         InterruptError: a signal while the run was being loaded, or a second one.
     """
@@ -145,7 +145,7 @@ def train(
             )
         run_id = run_id_of(directory.path)
         previous = read_status(directory.path) if resume else None
-        writer = reporting_to(directory, run_id, address_from_environment())
+        writer = reporting_to(directory, run_id, address_from_environment(), resumed=resume)
         published, epoch = last.version if last is not None else None, directory.epoch
         report = Report(config, run_id, runtime.name, writer, published=published, previous=previous, epoch=epoch)
         log = stack.enter_context(logging_to(directory.path))
@@ -155,23 +155,27 @@ def train(
         stack.enter_context(runtime.around(directory.path, Path(registry), partial(_end_now, report, directory)))
         num_lost, furthest = 0, -1
         while True:
-            with doing("starting", aloud=False):
-                begun = open_run(config, directory, registry, resume=resume, start=start, runtime=runtime)
-            with closing(begun) as run:
-                try:
-                    done = _run(run, registry, publish, signals, report, on_iteration)
-                except StateLostError as error:  # with a machine of the cluster
-                    num_lost = num_lost + 1 if run.iteration <= furthest else 1
-                    furthest = max(furthest, run.iteration)
-                    if num_lost >= MAX_STATES_LOST:
-                        raise
-                    _logger.warning("%s", error)
-                    resume = True
-                else:
-                    said = f", published {done.version}" if done.version is not None else ""
-                    at = f"iteration {done.iteration}, {done.num_env_steps} env steps"
-                    log(f"the run is {done.reason} at {at}{said}")
-                    return done
+            reached = -1
+            try:
+                with doing("starting", aloud=False):
+                    begun = open_run(config, directory, registry, resume=resume, start=start, runtime=runtime)
+                with closing(begun) as run:
+                    try:
+                        done = _run(run, registry, publish, signals, report, on_iteration)
+                    finally:
+                        reached = run.iteration
+            except StateLostError as error:  # with a machine of the cluster
+                num_lost = num_lost + 1 if reached <= furthest else 1
+                furthest = max(furthest, reached)
+                if num_lost >= MAX_STATES_LOST:
+                    raise
+                _logger.warning("%s", error)
+                resume = directory.exists
+            else:
+                said = f", published {done.version}" if done.version is not None else ""
+                at = f"iteration {done.iteration}, {done.num_env_steps} env steps"
+                log(f"the run is {done.reason} at {at}{said}")
+                return done
             time.sleep(BACK_OFF_S * (2 ** (num_lost - 1) - 1))
 
 

@@ -10,6 +10,8 @@
 | ``tandem:run:ID:heartbeat`` | string, expires | is there until ``HEARTBEAT_S`` after its process last reported |
 | ``tandem:run:ID:epoch`` | string | ``RUN:EPOCH``: identity of the run and number of the process that reports |
 
+A run's keys go ``KEPT_S`` after its last report.
+
 Records are in a sorted set and no stream: written twice, as after an answer that got lost, a record is there once, and
 a resumed run's takes the place of the earlier one.
 """
@@ -17,7 +19,7 @@ a resumed run's takes the place of the earlier one.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -31,6 +33,9 @@ Content = Literal["status", "metrics", "goals", "stop", "heartbeat", "epoch"]
 MAX_RECORDS = 20_000
 """Of one run, about 60 MB; ``metrics.jsonl`` has them all."""
 HEARTBEAT_S = 10.0
+KEPT: Sequence[Content] = ("status", "metrics", "goals", "epoch")
+KEPT_S = 30 * 86_400
+"""Else a Redis with bounded memory is full once some runs have ended; their directories have all of it."""
 _FORM = "redis://[[USER]:PASSWORD@]HOST[:PORT][/DB], with %-escapes for other characters than letters and digits"
 
 

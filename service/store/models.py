@@ -122,7 +122,7 @@ class RunStatus(FrozenModel):
 
     run_id: str = Field(pattern=RUN_ID)
     name: str = Field(description="registry name of what it makes")
-    study: str | None = Field(None, description="whose run of one seed it is, as far as its directory tells")
+    study: str | None = Field(None, description="that the run is part of, as far as its directory tells")
     trial: Trial | None = Field(None, description="of a run that learns a task; null for others")
     runtime: Literal["local", "ray"]
     state: RunState

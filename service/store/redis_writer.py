@@ -12,7 +12,7 @@ from threading import Event, Thread
 
 from redis.exceptions import RedisError, WatchError
 
-from service.base.errors import RunTakenError
+from service.base.errors import RunTakenError, StoreUnavailableError
 from service.base.jsonl import plain
 from service.store import address as keys
 from service.store.address import Content, RedisAddress, reason_of
@@ -37,30 +37,30 @@ class RedisWriter:
     unblocked by ``close``. Status and grid that were not sent yet are replaced by newer ones, records wait in line.
 
     Args:
-        address: of a Redis that has to be there now; later it may go and come.
+        address: of a Redis, which may go and come.
         run_id: id of the run.
         run: identity of the run, by which runs of the same id are told apart.
         epoch: number of this process among those that ever ran it.
+        resumed: or else Redis has to be there now: its address may be mistyped.
 
     Raises:
         RunTakenError: another run with this id reports to this Redis.
-        StoreUnavailableError: Redis is not there, or does not let us in.
+        StoreUnavailableError: of a new run, Redis is not there, or does not let us in.
     """
 
-    def __init__(self, address: RedisAddress, run_id: str, *, run: str, epoch: int) -> None:
+    def __init__(self, address: RedisAddress, run_id: str, *, run: str, epoch: int, resumed: bool = False) -> None:
         self._address, self._run_id, self._run, self._epoch = address, run_id, run.encode(), epoch
         self._mine, self._key = f"{run}:{epoch}".encode(), partial(keys.run_key, run_id)
         self._connected_anew = Event()
         self._client = address.client(TIMEOUT_S, self._connected_anew.set)
-        with address.errors():
-            theirs = self._client.get(self._key("epoch")) or self._mine
-            if theirs.partition(b":")[0] != self._run and self._client.exists(self._key("heartbeat")):
-                raise RunTakenError(
-                    f"another run with the id {run_id} reports to Redis at {address}; stop that one (if it has ended, "
-                    f"wait {keys.HEARTBEAT_S:.0f} s), or name another --run-dir"
-                )
-            self._client.set(self._key("epoch"), self._mine)
-            self._client.delete(self._key("stop"))
+        self._is_known = False
+        """Whether Redis has taken this process's epoch."""
+        try:
+            with address.errors():
+                self._introduce()
+        except StoreUnavailableError:
+            if not resumed:
+                raise  # or else the thread tries again, and warns
         self._newest: dict[Content, RunStatus | GoalGrid] = {}
         """Status and grid as they are now."""
         self._there: dict[Content, RunStatus | GoalGrid] = {}
@@ -146,12 +146,30 @@ class RedisWriter:
                 self._client.delete(self._key("heartbeat"))
             self._client.close()
 
+    def _introduce(self) -> None:
+        """Tell Redis who reports from now on.
+
+        Raises:
+            RunTakenError: another run reports under this run id.
+        """
+        theirs = self._client.get(self._key("epoch")) or self._mine
+        if theirs.partition(b":")[0] != self._run and self._client.exists(self._key("heartbeat")):
+            raise RunTakenError(
+                f"another run with the id {self._run_id} reports to Redis at {self._address}; stop that one (if it has "
+                f"ended, wait {keys.HEARTBEAT_S:.0f} s), or name another --run-dir"
+            )
+        self._client.set(self._key("epoch"), self._mine)
+        self._client.delete(self._key("stop"))
+        self._is_known = True
+
     def _send(self) -> None:
         """Send one transaction.
 
         Raises:
-            RunTakenError: a newer process reports under this run id.
+            RunTakenError: another run, or a newer process of this one, reports under this run id.
         """
+        if not self._is_known:
+            self._introduce()
         del self._waiting[: -keys.MAX_RECORDS]  # Redis would keep no more of them
         newest, records = dict(self._newest), self._waiting[:BATCH]
         with self._client.pipeline() as pipe:
@@ -171,6 +189,8 @@ class RedisWriter:
                 pipe.zremrangebyscore(key, iteration, "+inf")
                 pipe.zadd(key, {text: iteration})
             pipe.zremrangebyrank(key, 0, -keys.MAX_RECORDS - 1)
+            for content in keys.KEPT:
+                pipe.expire(self._key(content), keys.KEPT_S)
             pipe.exists(self._key("stop"))
             self._stop = bool(pipe.execute()[-1])
         self._there = newest

@@ -32,18 +32,21 @@ STATUS_INTERVAL_S = 1.0
 _logger = logging.getLogger(__name__)
 
 
-def reporting_to(directory: RunDirectory, run_id: str, address: RedisAddress | None) -> RunWriter:
+def reporting_to(
+    directory: RunDirectory, run_id: str, address: RedisAddress | None, *, resumed: bool = False
+) -> RunWriter:
     """The writer of a run to its directory, which the caller has claimed, and to the Redis that is given.
 
     Raises:
         RunTakenError: see ``RedisWriter``; the directory is then as it was.
-        StoreUnavailableError: Redis is not there, or does not let us in.
+        StoreUnavailableError: of a new run, Redis is not there, or does not let us in.
     """
     if address is None:
         return RunWriter(directory)
     from service.store.redis_writer import RedisWriter  # where there is no Redis, its package is not needed
 
-    return RunWriter(directory, RedisWriter(address, run_id, run=directory.history.run, epoch=directory.epoch))
+    run, epoch = directory.history.run, directory.epoch
+    return RunWriter(directory, RedisWriter(address, run_id, run=run, epoch=epoch, resumed=resumed))
 
 
 class RunWriter:

@@ -78,10 +78,7 @@ WORKER_GROUP = {
 RAY_CLUSTER = {
     "rayVersion!": str,
     "authOptions!": {"mode!": {"token"}, "secretName!": str},
-    "gcsFaultToleranceOptions": {
-        "redisAddress!": str,
-        "redisPassword!": {"valueFrom!": {"secretKeyRef!": SECRET_KEY}},
-    },
+    "upgradeStrategy": {"type!": {"Recreate", "None"}},
     "headGroupSpec!": HEAD_GROUP,
     "workerGroupSpecs!": [WORKER_GROUP],
 }

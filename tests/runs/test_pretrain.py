@@ -13,6 +13,8 @@ from service.base.errors import ConfigError
 from service.config import parse_config
 from service.envs import rules
 from service.envs.sampling import draw_goals
+from service.methods.method import StateLostError
+from service.methods.self_play import LocalSelfPlay
 from service.registry.registry import Registry
 from service.runs import train as module
 from service.runs.resuming import resumed_config
@@ -63,6 +65,29 @@ def home(published, tmp_path, quick):
 def goes_on(home, steps=None, **kwargs):
     overrides = [f"run.total_env_steps={steps}"] if steps is not None else []
     return run_pretrain(home, resumed_config(RunDirectory(home / "run"), overrides), resume=True, **kwargs)
+
+
+def test_a_run_goes_back_to_its_checkpoint_as_often_as_its_state_is_lost_also_as_it_starts_again(
+    tmp_path, quick, monkeypatch, caplog
+):
+    monkeypatch.setattr(module, "BACK_OFF_S", 0.0)
+    start, left = LocalSelfPlay.start, ["while it learns", "while it starts"]
+
+    def lose(what):
+        if left and left[0] == what:
+            del left[0]
+            raise StateLostError(f"lost {what}")
+
+    def start_or_lose(self, state=None):
+        if state is not None:
+            lose("while it starts")
+        start(self, state)
+
+    monkeypatch.setattr(LocalSelfPlay, "start", start_or_lose)
+    done = run_pretrain(tmp_path, on_iteration=lambda metrics: lose("while it learns"))
+    assert (done.reason, left) == ("finished", [])
+    said = [message.partition(";")[0] for message in caplog.messages if message.startswith("lost")]
+    assert said == ["lost while it learns", "lost while it starts"]
 
 
 # --- to the end ------------------------------------------------------------------------------------------------------

@@ -17,9 +17,9 @@ def a_silent_status(**changes):
     return a_status(heartbeat=datetime.now(UTC) - timedelta(seconds=61), **changes)
 
 
-def a_writer(address, run_id="cube", *, run="a", epoch=1):
+def a_writer(address, run_id="cube", *, run="a", epoch=1, resumed=False):
     """A process that reports to Redis."""
-    return RedisWriter(address, run_id, run=run, epoch=epoch)
+    return RedisWriter(address, run_id, run=run, epoch=epoch, resumed=resumed)
 
 
 def a_grid(iteration=1):

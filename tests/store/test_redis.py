@@ -68,6 +68,44 @@ def test_killed_and_back_at_the_same_place(redis, writer, reader, monkeypatch):
     wait_until(lambda: writer.troubles() == [])
 
 
+def test_a_resumed_run_begins_while_redis_is_away(redis, reader, caplog):
+    redis.kill()
+    with pytest.raises(StoreUnavailableError):
+        a_writer(redis.address)
+    writer = a_writer(redis.address, resumed=True)
+    train(writer, range(1, 11))
+    assert len(wait_until(writer.troubles)) == 1
+    assert_one_line(caplog.messages[0], "Redis at", "the run goes on")
+    redis.revive()
+    wait_until(lambda: reader.runs() and iterations(reader)[-1:] == [10])
+    assert redis.address.client(1.0).get(run_key("cube", "epoch")) == b"a:1"
+    writer.close()
+
+
+def test_a_resumed_run_whose_id_another_one_has_falls_silent_at_the_first_contact(redis, reader):
+    other = a_writer(redis.address, run="b")
+    train(other, range(1, 3))
+    wait_until(lambda: reader.runs() and iterations(reader) == [1, 2])
+    os.kill(redis.pid, signal.SIGSTOP)
+    try:
+        writer = a_writer(redis.address, resumed=True)
+    finally:
+        os.kill(redis.pid, signal.SIGCONT)
+    wait_until(lambda: any("another process reports there" in each.text for each in writer.troubles()))
+    writer.close()
+    assert redis.address.client(1.0).get(run_key("cube", "epoch")) == b"b:1"
+    other.close()
+
+
+def test_what_a_run_has_told_goes_some_time_after_its_last_report(redis, writer, reader):
+    train(writer, range(1, 3))
+    wait_until(lambda: reader.runs() and iterations(reader) == [1, 2])
+    writer.close()
+    client = redis.address.client(1.0)
+    for key in client.keys("tandem:run:cube:*"):
+        assert 0 < client.ttl(key) <= address.KEPT_S, key
+
+
 def test_stopped_for_a_while(redis, reader, monkeypatch):
     """It does not answer, and its connections stay open: worse than being dead."""
     monkeypatch.setattr(redis_writer, "TIMEOUT_S", 0.3)

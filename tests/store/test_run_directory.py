@@ -183,6 +183,7 @@ def test_records_wait_for_room_and_then_come_in_their_order(directory, caplog):
     record(directory, 1)
     with no_room_above(directory.metrics_file.stat().st_size + 10):
         record(directory, 2, 3)
+        assert directory.sync()["metrics.jsonl"] == Extent.of(directory.metrics_file.read_bytes())
     assert [row["iteration"] for row in read_lines(directory.metrics_file)] == [1]
     record(directory, 4)
     assert [row["iteration"] for row in read_lines(directory.metrics_file)] == [1, 2, 3, 4]
