@@ -53,7 +53,7 @@ NUM_BINS = {"height": 13, "distance": 16}
 OURS = "ours"
 """Name of self-play among the methods of skills."""
 SKILL_POINTS = 100
-KEPT_OF_SKILLS = (*COUNTERS, "evaluation/coverage", "skills/", "learner/entropy", "bob/env_steps_fraction")
+KEPT_OF_SKILLS = (*COUNTERS, "evaluation/coverage", "skills/", "learner/", "bob/env_steps_fraction")
 """Beginnings of the names of metrics that are kept of skills."""
 NUM_EPISODES, NUM_STEPS = 300, 50
 ASKED, ASKED_STEPS = 0.90, 30e6

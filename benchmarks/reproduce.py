@@ -32,8 +32,6 @@ PAPER_PRIMITIVES = {seed: f"panda-cube-paper@seed-{10 + seed}" for seed in PRIMI
 """The same, of the recipe as the paper has it."""
 SKILL_METHODS = ("lsd", "metra", "dads", "diayn")
 SKILL_ENV_STEPS = 4_000_000
-SKILL_HOLD_STEPS = 1
-"""Env steps that an orchestrator holds a skill; 1, 5 and 25 were compared (log, T20)."""
 LONGER_ENV_STEPS = 1_000_000
 MANY_UPDATES = 32
 """For 64 env steps, instead of 8."""
@@ -117,11 +115,8 @@ def _skills(out: Path, seed: int) -> Iterator[Experiment]:
         yield _discover(out, method, seed)
     for method in SKILL_METHODS:
         rows = (method, f"{method}-zero-shot") if method in ("lsd", "metra") else (method,)
-        hold = ("--set", f"skill_steps={SKILL_HOLD_STEPS}")
         for row in rows:
-            for task in PAPERS:
-                settings = hold if row == method else ()
-                yield _table(out, "downstream", task, row, seed, f"{_skills_name(method, seed)}@1", settings)
+            yield from (_table(out, "downstream", task, row, seed, f"{_skills_name(method, seed)}@1") for task in PAPERS)
 
 
 def _skills_name(method: str, seed: int) -> str:

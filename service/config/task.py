@@ -40,9 +40,9 @@ class TaskConfig(Config):
     primitives_digest: str | None = Field(None, description="of their parameters; a new run records it")
     sac: SACConfig = SACConfig()
     skill_steps: int = Field(
-        5,
+        1,
         ge=1,
-        description="env steps that a skill is held; methods with primitives act anew in each",
+        description="env steps that a skill is held: 5 and 25 were worse (docs/results, T20)",
     )
     reward_margin_m: float = Field(
         0.01,

@@ -139,7 +139,7 @@ class TaskLearning(Method):
             success_distance_m=SUCCESS_DISTANCE_M - config.reward_margin_m,
             num_threads=config.run.num_threads,
         )
-        return self._how.enter(env, spread_seed(config.seed, 3), self._acts_with, config.skill_steps)
+        return self._how.enter(env, spread_seed(config.seed, 3), self._acts_with, config.hold_steps)
 
 
 class Hindsight:
