@@ -116,7 +116,9 @@ def _skills(out: Path, seed: int) -> Iterator[Experiment]:
     for method in SKILL_METHODS:
         rows = (method, f"{method}-zero-shot") if method in ("lsd", "metra") else (method,)
         for row in rows:
-            yield from (_table(out, "downstream", task, row, seed, f"{_skills_name(method, seed)}@1") for task in PAPERS)
+            yield from (
+                _table(out, "downstream", task, row, seed, f"{_skills_name(method, seed)}@1") for task in PAPERS
+            )
 
 
 def _skills_name(method: str, seed: int) -> str:

@@ -5,6 +5,7 @@ Importing this package is cheap: torch, MuJoCo and matplotlib come in with the p
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,7 +27,7 @@ __all__ = ["evaluate", "load", "make_env", "train"]
 
 def load(
     reference: str = "panda-cube@champion",
-    registry: Path | str = "registry",
+    registry: Path | str | None = None,
     primitives: str | None = None,
     *,
     run_task_code: bool = False,
@@ -36,10 +37,10 @@ def load(
     Args:
         reference: NAME, NAME@ALIAS or NAME@VERSION; or the path of a run, of a checkpoint of a run, or of an
             exported version.
-        registry: directory to look in first; a version or alias it does not have is looked up among what comes with
-            the package. Or the ``http://HOST:PORT`` of a ``tandem serve``, which alone is asked, with the token in
-            TANDEM_TOKEN. What a policy of a task acts with is looked up there, too, by the version that it was trained
-            with, and among what comes with the package.
+        registry: directory to look in first, by default TANDEM_REGISTRY or ``registry``; a version or alias it does not
+            have is looked up among what comes with the package. Or the ``http://HOST:PORT`` of a ``tandem serve``,
+            which alone is asked, with the token in TANDEM_TOKEN. What a policy of a task acts with is looked up there,
+            too, by the version that it was trained with, and among what comes with the package.
         primitives: what a policy of a task acts with, where that has moved. The parameters have to be those it was
             trained with.
         run_task_code: run what code the task of a published policy brings; acting needs none. The directory of a run
@@ -55,7 +56,7 @@ def load(
     """
     from service.registry import loading
 
-    return loading.load(reference, registry, primitives, run_task_code=run_task_code)
+    return loading.load(reference, registry or _registry(), primitives, run_task_code=run_task_code)
 
 
 def train(
@@ -65,7 +66,7 @@ def train(
     method: str | None = None,
     primitives: str | None = None,
     run_dir: Path | str | None = None,
-    registry: Path | str = "registry",
+    registry: Path | str | None = None,
     resume: bool = False,
     publish: bool = False,
     on_iteration: Callable[[dict[str, float]], Ending | None] | None = None,
@@ -79,7 +80,7 @@ def train(
         method: of a task, or of skill discovery.
         primitives: that the method of a task takes.
         run_dir: where it keeps everything; default: ``runs/NAME``.
-        registry: where it publishes, and finds what it takes.
+        registry: where it publishes, and finds what it takes; by default TANDEM_REGISTRY or ``registry``.
         resume: go on with the run there.
         publish: publish what was learned.
         on_iteration: called with the metrics of every iteration; what it returns, if anything, ends the run.
@@ -97,6 +98,7 @@ def train(
     file, first = named(what, method, primitives)
     overrides = [*first, *settings]
     begun = file if file is not None or first else recipes()[DEFAULT_RECIPE]
+    registry = registry or _registry()
     path = Path(run_dir) if run_dir is not None else Path("runs") / load_config(begun, overrides).directory_name
     directory = RunDirectory(path)
     if resume:
@@ -118,10 +120,15 @@ def evaluate(
         goals: ``table``, ``air``, ``volume``, ``mixed`` or ``one`` in place of the task's.
         num_episodes: each from a fresh reset.
         seed: of the episodes.
+
+    Raises:
+        ValueError: no episodes.
     """
     from service.actors import evaluation
     from service.methods.task_evaluation import FINAL_SEED
 
+    if num_episodes < 1:
+        raise ValueError(f"num_episodes = {num_episodes}; give at least 1")
     on = trained.on(task)
     first_seed = seed if on.task is None else seed + FINAL_SEED
     return evaluation.evaluate(
@@ -130,11 +137,16 @@ def evaluate(
     )  # fmt: skip
 
 
+def _registry() -> str:
+    """Where commands look, too."""
+    return os.environ.get("TANDEM_REGISTRY") or "registry"
+
+
 def make_env(task: str | Task | None = None, trained: Trained | None = None, *, num_envs: int = 1) -> TabletopVectorEnv:
     """N worlds of a task as one Gymnasium vector environment; ``gymnasium.make`` has single ones.
 
     Args:
-        task: by name or file, or an object; None: goals in the volume and on the table (beside a fixture: on the table).
+        task: by name or file, or an object; None: goals in the volume and on the table; beside a fixture on the table.
         trained: in whose world it is; None: the paper's.
         num_envs: N.
     """

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from service import load as load
     from service import make_env as make_env
     from service import train as train
+    from service.actors.evaluation import Evaluation as Evaluation
     from service.base import errors as errors
     from service.config import Config as Config
     from service.envs.gym.tabletop import TabletopEnv as TabletopEnv
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
     from service.methods.intrinsic_reward import IntrinsicReward as IntrinsicReward
     from service.methods.method import Iteration as Iteration
     from service.methods.method import Method as Method
+    from service.methods.method import State as State
+    from service.registry.loading import Trained as Trained
 
 _PLACES = {
     "load": "service",
@@ -59,6 +62,9 @@ _PLACES = {
     "Config": "service.config",
     "Method": "service.methods.method",
     "Iteration": "service.methods.method",
+    "State": "service.methods.method",
+    "Trained": "service.registry.loading",
+    "Evaluation": "service.actors.evaluation",
     "GoalSource": "service.generator.sources",
     "Known": "service.generator.sources",
     "IntrinsicReward": "service.methods.intrinsic_reward",
@@ -67,11 +73,13 @@ _PLACES = {
 __all__ = list(_PLACES)
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _PLACES:
-        raise AttributeError(f"module {__name__!r} has no {name!r}; it has {', '.join(_PLACES)}")
-    module = importlib.import_module(_PLACES[name])
-    return module if module.__name__.rpartition(".")[2] == name else getattr(module, name)
+if not TYPE_CHECKING:  # for which a name that is not above would be anything
+
+    def __getattr__(name: str) -> Any:
+        if name not in _PLACES:
+            raise AttributeError(f"module {__name__!r} has no {name!r}; it has {', '.join(_PLACES)}")
+        module = importlib.import_module(_PLACES[name])
+        return module if module.__name__.rpartition(".")[2] == name else getattr(module, name)
 
 
 def __dir__() -> list[str]:

@@ -73,7 +73,7 @@ def text_of(origin: str) -> str:
     try:
         return read_regular(path, MAX_BYTES, follow=True).decode("utf-8-sig")
     except FileNotFoundError:
-        raise CodeError(f"{origin}: no such file; write FILE.py, FILE.py:NAME or MODULE:NAME") from None
+        raise CodeError(f"{path.absolute()}: no such file; write FILE.py, FILE.py:NAME or MODULE:NAME") from None
     except OSError as error:
         raise CodeError(f"{origin}: {error.strerror}; a run keeps its text") from None
     except UnicodeDecodeError as error:
@@ -144,7 +144,14 @@ def naming_errors_of(origin: str) -> Iterator[None]:
         if isinstance(error, SyntaxError) and error.filename == origin:  # and not of what it imports
             lines, said = [error.lineno], error.msg
         where = f"{origin}:{lines[-1]}" if lines else origin
+        if isinstance(error, ModuleNotFoundError):
+            said += "; a file stands alone: put what it needs into it, or install that"
         raise CodeError(f"{where}: {type(error).__name__}{': ' * bool(said)}{said}") from error
+
+
+def origin_of(kind: type) -> str | None:
+    """The file of a class that ``find`` gave; None of any other."""
+    return sys.modules[kind.__module__].__file__ if kind.__module__.startswith(PRIVATE) else None
 
 
 def checked(where: str, given: Array, shape: tuple[int, ...], *, truth: bool = False) -> Array:
@@ -164,7 +171,8 @@ def checked(where: str, given: Array, shape: tuple[int, ...], *, truth: bool = F
         wanted = f"{'bool' if truth else 'float'} of shape {shape}"
         raise CodeError(f"{where} gave {given.dtype} of shape {given.shape}; give {wanted}")
     if not np.isfinite(given).all():
-        raise CodeError(f"{where} gave a number that is not finite; give finite ones")
+        place = tuple(int(each) for each in np.argwhere(~np.isfinite(given))[0])
+        raise CodeError(f"{where} gave {given[place]} at {list(place)} of shape {shape}; give finite numbers")
     return given if truth else given.astype(np.float64)
 
 

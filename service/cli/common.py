@@ -81,7 +81,9 @@ ReferenceArgument = Annotated[
 ActsWithOption = Annotated[
     str | None,
     typer.Option(
-        "--primitives", metavar=REFERENCE, help="New place of the primitives or skills that a task's policy uses, if they moved."
+        "--primitives",
+        metavar=REFERENCE,
+        help="New place of the primitives or skills that a task's policy uses, if they moved.",
     ),
 ]
 TaskOption = Annotated[

@@ -12,13 +12,11 @@ from service.base.errors import RegistryError, StorageError, one_line
 from service.base.files import write_atomic
 from service.cli.common import (
     REGISTRY,
-    SOURCE,
     ActsWithOption,
     CommandGroup,
     JsonOption,
     QuietOption,
     RegistryOption,
-    SourceOption,
     loading,
     print_json,
     print_table,

@@ -74,7 +74,8 @@ def train(
         ),
     ] = None,
     config: Annotated[
-        str | None, typer.Option(metavar="NAME|FILE", autocompletion=targets, help="Recipe or file, given as an option.")
+        str | None,
+        typer.Option(metavar="NAME|FILE", autocompletion=targets, help="The same, as an option."),
     ] = None,
     method: Annotated[
         str | None,
@@ -106,7 +107,10 @@ def train(
     ] = None,
     grid: Annotated[
         list[str] | None,
-        typer.Option(metavar="A.B=C,D", help="A study: a run for each value of a key; repeatable: then a run for each combination."),
+        typer.Option(
+            metavar="A.B=C,D",
+            help="A study: a run for each value of a key; repeated: each combination.",
+        ),
     ] = None,
     parallel: Annotated[
         int | None, typer.Option(help="Runs of a study at once; default: as many as there are cores for.", min=1)

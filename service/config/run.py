@@ -26,7 +26,11 @@ class RunConfig(FrozenModel):
     evaluation_episodes: int = Field(100, ge=1)
     final_episodes: int = Field(300, ge=1, description="of the evaluation at the end; paper: 16, likely")
     evaluation_steps: int = Field(50, ge=1)
-    num_threads: int = Field(0, ge=0, description="threads that step worlds, and in a task's run those of torch; 0: one per core that may be used, and one of torch")
+    num_threads: int = Field(
+        0,
+        ge=0,
+        description="threads that step worlds, and of a task's torch; 0: a core each, and one for torch",
+    )
 
 
 class Config(FrozenModel):

@@ -14,6 +14,8 @@ from service.config.run import SUCCESS_DISTANCE_M, Config, RunConfig
 from service.config.skills import SKILLS_OF, SACConfig
 
 _TAKE_SKILLS = (*SKILLS_OF, "any-skills")
+_UNUSED_SKILL_STEPS = (1, 5)
+"""What configurations of other methods say: the default, and the one of earlier versions."""
 
 
 class TaskRunConfig(RunConfig):
@@ -30,6 +32,7 @@ class TaskConfig(Config):
 
     made_in: ClassVar[str] = "service.methods.task"
     makes: ClassVar[Literal["orchestrator"]] = "orchestrator"
+    resumable: ClassVar[tuple[str, ...]] = ("run.", "primitives=")  # which may have moved: their digest is checked
 
     method: str
     task: str = Field(description="a name of ``tandem tasks``, or FILE.py, FILE.py:NAME or MODULE:NAME, one of yours")
@@ -52,6 +55,9 @@ class TaskConfig(Config):
     )
     task_version: int = Field(0, ge=0, description="of the task's Gymnasium name; a new run records it")
     episode_steps: int = Field(50, ge=1, description="of the task; a new run records it")
+    task_world: dict[str, Any] | None = Field(
+        None, description="settings of the world of a task of yours, with what its files say; a new run records them"
+    )
     run: TaskRunConfig = TaskRunConfig()
 
     @property
@@ -66,7 +72,7 @@ class TaskConfig(Config):
 
     def as_in(self, saved: Self) -> Self:
         """The same, with the exact version of the primitives and their world, where these may be those of ``saved``."""
-        keys = ("primitives_digest", "task_version", "episode_steps", "code")
+        keys = ("primitives_digest", "task_version", "episode_steps", "task_world", "code")
         exact = {key: getattr(saved, key) for key in keys}
         update: dict[str, Any] = {key: value for key, value in exact.items() if key not in self.model_fields_set}
         if "world" not in self.model_fields_set:
@@ -97,7 +103,7 @@ class TaskConfig(Config):
             raise ValueError(
                 f"skill_steps {self.skill_steps}: an episode has {self.episode_steps} steps; hold it shorter"
             )
-        if self.skill_steps != type(self).model_fields["skill_steps"].default and self.method not in _TAKE_SKILLS:
+        if self.skill_steps not in _UNUSED_SKILL_STEPS and self.method not in _TAKE_SKILLS:
             raise ValueError(f"skill_steps is for methods that take skills, and {self.method} takes none: leave it out")
         if self.method.endswith("-her") and length_known and starts < episodes:
             raise ValueError(

@@ -34,7 +34,7 @@ _LOWEST = {"table_height_m": 0.0, "object_size": 1.0}
 
 
 class WorkspaceConfig(FrozenModel):
-    """The box in which goals are valid. Origin of the world: the table top, in front of the robot's base (of the Panda 0.6 m)."""
+    """The box in which goals are valid. Origin of the world: the table top, before the robot's base (Panda: 0.6 m)."""
 
     center_x_m: float = Field(-0.05, ge=-0.3, le=0.2, description="-0.05 keeps the downstream Larger task reachable")
     center_y_m: float = Field(0.0, ge=-0.3, le=0.3)

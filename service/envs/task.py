@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
 from service.base.types import Array, BoolArray, FloatArray, StateArray
@@ -196,25 +197,16 @@ class Task:
         return {**kept, "world": to_jsonable_python(dict(self.world), fallback=float), "goals": self.goal_kind}
 
 
-class _NotGiven:
+class _NotGiven(NDArrayOperatorsMixin):
     """Stands for a part of a view that is not known."""
-
-    __array_ufunc__ = None
 
     def __init__(self, part: str) -> None:
         self._part = part
 
-    def __getitem__(self, key: Any) -> Any:
+    def _refuse(self, *_: Any, **__: Any) -> Any:
         raise LookupError(f"{self._part} is not known here")
 
-    def __array__(self, *_: Any, **__: Any) -> Any:
-        return self[()]
-
-    def __eq__(self, other: object) -> Any:
-        return self[()]
-
-    __ne__ = __eq__
-    __hash__ = None  # type: ignore[assignment]
+    __getitem__ = __array__ = __array_ufunc__ = __len__ = __bool__ = __getattr__ = _refuse
 
 
 def view_of_places(achieved: Array, desired: Array) -> View:

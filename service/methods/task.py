@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +24,7 @@ from service.config.self_play import MCPConfig, SelfPlayConfig
 from service.config.task import TaskConfig
 from service.config.world import WorldConfig
 from service.envs.gym.vector import TabletopVectorEnv
+from service.envs.task import Task
 from service.envs.tasks import find_task
 from service.learner.off_policy import OffPolicyLoop
 from service.learner.replay import ReplayBuffer
@@ -59,10 +61,10 @@ class TaskLearning(Method):
         if config.primitives_digest not in (None, acts_with.digest):
             raise TandemError(
                 f"{acts_with.label} has other parameters than the {config.primitives} that this run began with: name "
-                "the registry that has those with --registry"
+                "the registry that has those with --registry, or their new place with --set primitives=PATH"
             )
         self.config, self._acts_with = config, acts_with
-        self._task = find_task(config.task, config.code)
+        self._task = find_task(config.task, config.code, config.task_world)
         torch.set_num_threads(config.run.num_threads or 1)
         self._worlds = self._make_worlds()
         self.loop = make_loop(config, self._how, acts_with, self._worlds)
@@ -241,7 +243,7 @@ def begin(config: TaskConfig, registry: Path | str, start_from: Trained | None) 
     if config.world not in (WorldConfig(), found.config.world):
         raise ConfigError("world: a task is learned in the world of its primitives; leave out world")
     how.check(found)
-    task = find_task(config.task, config.code)
+    task = find_task(config.task, config.code, config.task_world)
     found.playing(task)  # is refused where it has not as many objects
     check_task(task, found.config.world, relabels=how.her_ratio is not None)
     exact = config.model_copy(
@@ -251,6 +253,7 @@ def begin(config: TaskConfig, registry: Path | str, start_from: Trained | None) 
             "primitives_digest": config.primitives_digest or (None if how.takes is None else found.digest),
             "task_version": task.version,
             "episode_steps": task.episode_steps,
+            "task_world": _as_read(task, found.config.world) if task.code else None,
             "code": recorded(config.task, config.code),
         }
     )
@@ -260,6 +263,12 @@ def begin(config: TaskConfig, registry: Path | str, start_from: Trained | None) 
         except ValidationError as error:
             raise ConfigError(f"{config.task}: {first_error(error)}") from None
     return exact
+
+
+def _as_read(task: Task, world: WorldConfig) -> dict[str, Any] | None:
+    """The settings of a task's world with the whole names of files, and what is read from them: they may change."""
+    read = task.world_from(world).model_dump(mode="json")
+    return {key: read[key] for key in task.world} or None
 
 
 def make(config: TaskConfig, registry: Path | str, start_from: Trained | None) -> TaskLearning:

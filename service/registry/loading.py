@@ -7,6 +7,7 @@ Acting is NumPy: nothing here needs torch.
 from __future__ import annotations
 
 import hashlib
+import logging
 import operator
 import re
 from collections.abc import Iterator, Mapping
@@ -19,7 +20,7 @@ import numpy as np
 from service.base.errors import ConfigError, TandemError
 from service.base.tensors import digest_of, split_parts
 from service.base.types import Array, FloatArray
-from service.base.user_code import parse_reference
+from service.base.user_code import changed_since, parse_reference
 from service.config import Config, WorldConfig
 from service.config.run import SUCCESS_DISTANCE_M
 from service.config.skills import SkillDiscoveryConfig
@@ -49,6 +50,7 @@ Spaces in a manifest have it as ``kind``; without it they are of primitives.
 """
 _SHOWN = 12
 """Characters of a digest in messages."""
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -323,7 +325,7 @@ def _task_of(spaces: Mapping[str, Any], manifest: Manifest, label: str, *, run_c
     if run_code:
         if not isinstance(code, dict) or not isinstance(code.get(reference.origin), str):
             raise TandemError(f"{label}: its manifest lacks the text of {reference.origin}; publish it again")
-        return find_task(name, code)
+        return find_task(name, code, cast("Any", manifest.config.get("task_world")))
     why = (
         f"{label}: what counts is said by code of its publisher, {name}; read it in the manifest, then give "
         "--run-task-code"
@@ -404,6 +406,8 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
     parts, path = split_parts(saved.arrays), file or directory.path
     if config.makes is None or config.part not in parts:
         raise TandemError(f"{label} is a run of the method {config.method}, which makes nothing that can be loaded")
+    for origin in changed_since(config.code):
+        _logger.warning("%s has another text by now; %s keeps the one that it began with", origin, label)
     parameters = parts[config.part]
     if isinstance(config, SkillDiscoveryConfig):
         return Trained(label, "skills", config, _skills(config, parameters), parameters, path=path)
@@ -412,7 +416,7 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
         if config.primitives_digest is not None:
             trained = _find_frozen(label, config.primitives, config.primitives_digest, place)
         policy = learned_policy(parameters, trained, config, config.hold_steps)
-        task = find_task(config.task, config.code)
+        task = find_task(config.task, config.code, config.task_world)
         about: dict[str, Any] = {"task": task, "method": config.method, "trained": trained}
         return Trained(label, "orchestrator", config, policy, parameters, path=path, **about)
     networks: dict[str, Parameters] = {"bob/policy": parameters}

@@ -58,10 +58,13 @@ class Registry:
         Raises:
             RegistryError: it is marked as only read, as the one that comes with tandem is; or it cannot be written.
         """
-        there = next(path for path in (self.root.absolute(), *self.root.absolute().parents) if path.exists())
-        if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
-            what = "is not writable" if there.is_dir() else "is no directory"
-            raise RegistryError(f"cannot write {self.root}: {there} {what}; name another with --registry")
+        root = self.root.absolute()
+        there = next(path for path in (root, *root.parents) if os.path.exists(path))
+        of_others = [root / "models", self.blob_path("0" * 64).parent]  # where several users publish
+        for path in (there, *filter(os.path.exists, of_others)):
+            if not path.is_dir() or not os.access(path, os.W_OK | os.X_OK):
+                what = "is not writable" if path.is_dir() else "is no directory"
+                raise RegistryError(f"cannot write {self.root}: {path} {what}; name another with --registry")
         # a file: it is found through whatever path leads to the directory
         if self.is_only_read or (self.root / READ_ONLY_FILE).exists():
             raise RegistryError(

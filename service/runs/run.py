@@ -15,10 +15,11 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from service.base.errors import CheckpointError, ConfigError, DivergedError
+from service.base.errors import CheckpointError, ConfigError, DivergedError, TandemError
 from service.base.jsonl import Extent
 from service.base.tensors import split_parts
 from service.base.types import Arrays, Metrics
+from service.base.user_code import CodeError, naming_errors_of, origin_of
 from service.config import Config
 from service.methods.method import Iteration, Method, State
 from service.policies.parameters import PolicyError
@@ -82,7 +83,11 @@ class Run:
         self._on_iteration: OnIteration = lambda metrics: None
         self._on_beat: OnBeat = lambda: None
         saved = self._load() if resume else None
-        self.method = method = make()
+        self._origin = origin_of(type(config))
+        """Of a method of a user's, its file."""
+        with self.naming_errors():
+            method = make()
+        self.method = method
         method.on_wait = self._beat
         try:
             if saved is not None:
@@ -158,12 +163,20 @@ class Run:
         played, interval = self.iteration, self.config.run.evaluation_interval
         evaluated: Metrics = {}
         try:
-            ended = method.step()
+            with self.naming_errors():
+                ended = method.step()
+            if ended is not None and self._origin is not None:
+                self._check(ended, before)
             if ended is not None and interval and self.iteration % interval == 0:
-                with method.timing("evaluate"):
+                with method.timing("evaluate"), self.naming_errors():
                     evaluated = method.evaluate()
         except (DivergedError, PolicyError) as error:
             raise self._diverged(error, played) from error
+        except CodeError as error:
+            raise CodeError(
+                f"{error}; the run has ended. It keeps the text that it began with: correct the file, and begin "
+                "another one (--run-dir)"
+            ) from error
         self._iteration_s += time.perf_counter() - begun
         if ended is None:
             self._beat()
@@ -179,6 +192,26 @@ class Run:
         if self.iteration % self.config.run.checkpoint_interval == 0:
             with self._tolerating(f"and saves again after {self.config.run.checkpoint_interval} iterations"):
                 self._save()
+
+    @contextmanager
+    def naming_errors(self) -> Iterator[None]:
+        """Say of an unexpected error of a user's method where in its file it comes from."""
+        try:
+            yield
+        except TandemError:
+            raise
+        except Exception:
+            if self._origin is None:
+                raise
+            with naming_errors_of(self._origin):
+                raise
+
+    def _check(self, ended: object, before: int) -> None:
+        """Check an iteration of a user's method, which began at so many env steps."""
+        if not isinstance(ended, Iteration):
+            raise CodeError(f"{self._origin}: step gave a {type(ended).__name__}; give an Iteration or None")
+        if self.num_env_steps <= before:
+            raise CodeError(f"{self._origin}: an iteration made no env steps; say how many with self.count(NUMBER)")
 
     def _record(self, ended: Iteration, metrics: Metrics) -> None:
         for name, diverged in ended.diverged.items():
@@ -225,7 +258,8 @@ class Run:
         """
         directory = self.directory
         with self.method.timing("checkpoint"):
-            arrays, values = flatten(self.method.state())
+            with self.naming_errors():
+                arrays, values = flatten(self.method.state())
             directory.check_owner()
             meta = {
                 "env_steps": self.num_env_steps,

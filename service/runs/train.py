@@ -252,9 +252,13 @@ def _run(
 
 def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, report: Report) -> Finished:
     _logger.info("learning is over; now evaluating, publishing, drawing and recording a video")
-    config, directory, parameters = run.config, run.directory, run.method.parameters()
+    config, directory = run.config, run.directory
+    with run.naming_errors():
+        parameters, measured = run.method.parameters(), run.method.measure()
     # a method of a user's may give numbers of NumPy's, and such as are none
-    metrics = {name: value for name, value in plain(run.method.measure()).items() if value is not None}
+    metrics = {name: value for name, value in plain(measured).items() if value is not None}
+    if missing := measured.keys() - metrics.keys():
+        _logger.warning("measured, and no finite number: %s", ", ".join(sorted(missing)))
     version = None
     run.close()
     directory.check_owner()
@@ -325,7 +329,7 @@ def _measure(config: Config, learned: Trained) -> Metrics:
         return measure_skills(config, learned.parameters)
     if isinstance(config, TaskConfig):
         seed, run = config.seed + FINAL_SEED, config.run
-        player, task = learned.player(), find_task(config.task, config.code)
+        player, task = learned.player(), find_task(config.task, config.code, config.task_world)
         found = evaluate_on(task, config.world, player, run.final_episodes, seed, run.num_threads)
         return {f"evaluation/{key}": value for key, value in numbers_of(found).items()}
     return measure_bob(config, learned.parameters)

@@ -60,7 +60,7 @@ def primitives_router(registry: Registry) -> APIRouter:
         """Newest first, each with where it is, and the aliases."""
         if name not in shelf.names():
             registry.resolve(f"{name}@1")  # raises the error that says which names there are
-        return PrimitiveVersions(**dict(shelf.summary(name)), versions=shelf.versions(name)[:limit])
+        return PrimitiveVersions(**dict(shelf.summary(name)), versions=shelf.versions(name, limit))
 
     @router.get(
         "/primitives/{name}/versions/{version}",
@@ -139,14 +139,14 @@ class Shelf:
             origins=tuple(origin for origin in reversed(self.registries) if self.registries[origin].versions(name)),
         )
 
-    def versions(self, name: str) -> tuple[VersionSummary, ...]:
-        """The versions of a name, newest first."""
+    def versions(self, name: str, limit: int) -> tuple[VersionSummary, ...]:
+        """The newest versions of a name, the newest first."""
         aliases = self._aliases(name)
         return tuple(
             self._describe(
                 origin, Version(name, number), [each for each in aliases if aliases[each] == (origin, number)]
             )
-            for number, origin in sorted(self._origins(name).items(), reverse=True)
+            for number, origin in sorted(self._origins(name).items(), reverse=True)[:limit]
         )
 
     def _origins(self, name: str) -> dict[int, Origin]:

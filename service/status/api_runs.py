@@ -83,13 +83,14 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
         ] = None,
         downstream: Annotated[bool | None, Query(description="only runs that learn a task, or only others")] = None,
     ) -> RunList:
-        """Newest start first."""
+        """Active ones first, and each newest start first."""
         found = [
             run
             for run in runs.runs()
             if (active is None or (run.state in ACTIVE) == active)
             and (downstream is None or (run.trial is not None) == downstream)
         ]
+        found.sort(key=lambda run: run.state not in ACTIVE)  # the limit must not hide a run that goes on
         sparklines = {}
         for run in found[:limit] if sparkline_of else ():
             with suppress(StoreError):  # it may be deleted just now

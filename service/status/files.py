@@ -53,6 +53,8 @@ class RunDirectories:
 
     def __init__(self, root: Path | None) -> None:
         self._root = root
+        self._found: dict[str, Path] = {}
+        """Of the last listing."""
 
     def files(self, run_id: str) -> list[RunFile]:
         """List those of ``RUN_FILES`` and older recordings that exist; empty if the run has no directory."""
@@ -88,14 +90,16 @@ class RunDirectories:
     def directory(self, run_id: str) -> Path | None:
         """Find the directory of a run; None if it is not on this machine."""
         # looked up instead of built from the id, so that no id leads outside the root
-        return self.directories().get(run_id)
+        known = self._found.get(run_id)
+        return known if known is not None and known.is_dir() else self.directories().get(run_id)
 
     def directories(self) -> dict[str, Path]:
         """The directories of runs that are on this machine, by their ids."""
         try:
-            return run_directories(self._root) if self._root is not None else {}
+            self._found = run_directories(self._root) if self._root is not None else {}
         except OSError:
             return {}
+        return self._found
 
     def _paths(self, run_id: str) -> dict[str, Path]:
         directory = self.directory(run_id)

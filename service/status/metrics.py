@@ -23,7 +23,7 @@ from service.store.models import ACTIVE, CONDITIONS, ActorStatus, Record, RunRea
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 NUM_ENDED_RUNS = 5
-MAX_RUNS = 50
+MAX_ACTIVE_RUNS = 50
 _STATES: tuple[RunState, ...] = get_args(RunState)
 _ACTOR_STATES: tuple[Literal["starting", "alive"], ...] = get_args(ActorStatus.model_fields["state"].annotation)
 _logger = logging.getLogger(__name__)
@@ -180,10 +180,9 @@ class Telemetry(Collector):
 
     def _newest_record(self, run: RunStatus) -> Record:
         try:
-            records = self._runs.metrics(run.run_id, after_iteration=max(0, run.iteration - 1))
+            return self._runs.newest(run.run_id) or {}
         except StoreError:  # such as a run that was deleted just now
             return {}
-        return records[-1] if records else {}
 
     def _about_registry(self) -> Iterator[_Family]:
         up, versions, aliases = _REGISTRY_UP.family(), _VERSIONS.family(), _ALIAS.family()
@@ -201,11 +200,11 @@ class Telemetry(Collector):
 
 
 def shown(runs: list[RunStatus]) -> list[RunStatus]:
-    """Select active runs, as they are listed, and the last ``NUM_ENDED_RUNS`` that ended; at most ``MAX_RUNS``."""
+    """Select ``MAX_ACTIVE_RUNS`` active runs, as they are listed, and the last ``NUM_ENDED_RUNS`` that ended."""
     active = [run for run in runs if run.state in ACTIVE]
     # Not by their start, by which they are listed: a long run that failed just now would be gone before its alert.
     ended = sorted((run for run in runs if run.state not in ACTIVE), key=lambda run: run.heartbeat, reverse=True)
-    return (active + ended[:NUM_ENDED_RUNS])[:MAX_RUNS]
+    return active[:MAX_ACTIVE_RUNS] + ended[:NUM_ENDED_RUNS]
 
 
 def _families(runs: list[tuple[RunStatus, Record]]) -> Iterator[_Family]:

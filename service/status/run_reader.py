@@ -79,6 +79,10 @@ class CombinedReader(RunReader):
         return self._disk_first(lambda reader: reader.metrics(run_id, after_iteration=after_iteration))
 
     @override
+    def newest(self, run_id: str) -> Record | None:
+        return self._disk_first(lambda reader: reader.newest(run_id))
+
+    @override
     def columns(self, run_id: str, names: Sequence[str] | None) -> Columns:
         return self._disk_first(lambda reader: reader.columns(run_id, names))
 

@@ -39,7 +39,8 @@ class RunFollower:
     def __init__(self, runs: RunReader, run: RunStatus, names: Collection[str] | None, after: int | None) -> None:
         self._runs, self._run_id = runs, run.run_id
         self._names = None if names is None else {*names, "iteration", "env_steps"}
-        self._last_iteration = max(0, run.iteration - 1) if after is None else after
+        self._last_iteration = after
+        """That the client has; None: it begins with the newest."""
         self._status: RunStatus | None = None
         self._unavailable = False
         self.ended = False
@@ -65,11 +66,12 @@ class RunFollower:
 
     def _new_records(self) -> list[ServerSentEvent]:
         # also read the last record that was sent: it is gone if the run was resumed from an earlier iteration
+        if self._last_iteration is None:
+            self._last_iteration = max(0, self._newest_iteration() - 1)
         records = self._runs.metrics(self._run_id, after_iteration=max(0, self._last_iteration - 1))
         events = []
         if self._last_iteration and not records:
-            remaining = self._runs.metrics(self._run_id)
-            self._last_iteration = int(remaining[-1]["iteration"] or 0) if remaining else 0
+            self._last_iteration = self._newest_iteration()
             events.append(ServerSentEvent(event="reset", data={"after_iteration": self._last_iteration}))
         for record in records:
             iteration = int(record["iteration"] or 0)
@@ -78,6 +80,10 @@ class RunFollower:
                 selected = {name: record[name] for name in record if self._names is None or name in self._names}
                 events.append(ServerSentEvent(event="metrics", data=selected, id=str(iteration)))
         return events
+
+    def _newest_iteration(self) -> int:
+        newest = self._runs.newest(self._run_id)
+        return int(newest["iteration"] or 0) if newest is not None else 0
 
 
 class Streams:

@@ -69,6 +69,7 @@ def task_table(statuses: Iterable[RunStatus], directories: Mapping[str, Path]) -
         except TandemError as error:
             problems.append(str(error))
     columns = sorted({run.column for run in runs}, key=lambda column: (*_place(column[0], TASKS), column[1]))
+    values = _values(runs)
     rows = [(_first(row).trial, row) for row in _rows(runs)]
     rows.sort(key=lambda row: (*_place(row[0].method, METHODS), str(row[0].primitives)))
     return TaskTable(
@@ -82,7 +83,7 @@ def task_table(statuses: Iterable[RunStatus], directories: Mapping[str, Path]) -
                 title=METHODS[trial.method].title if trial.method in METHODS else trial.method,
                 primitives=trial.primitives,
                 primitives_digest=trial.primitives_digest,
-                cells=tuple(_cell(row[column], runs) for column in columns if column in row),
+                cells=tuple(_cell(row[column], values[_first(row).made]) for column in columns if column in row),
             )
             for trial, row in rows
         ),
@@ -113,7 +114,7 @@ def _counts(key: str) -> bool:
     return key == "run.total_env_steps" or not (key in _ELSEWHERE or key.startswith("run."))
 
 
-@lru_cache(1000)
+@lru_cache(100_000)
 def _settings(config: Path, _stamp: int) -> dict[str, Any]:
     """A run's configuration, flat; the page asks every few seconds, and YAML is slow."""
     text = json.dumps(read_yaml(config), default=str, skipkeys=True)  # YAML has dates, and keys that are no text
@@ -139,7 +140,7 @@ def _rows(runs: Sequence[_Run]) -> list[dict[Column, list[_Run]]]:
     return [row for same in rows.values() for row in same]
 
 
-def _cell(runs: Sequence[_Run], all_runs: Sequence[_Run]) -> TaskCell:
+def _cell(runs: Sequence[_Run], values: Mapping[str, set[str]]) -> TaskCell:
     from service.methods.task_evaluation import rate_of
 
     ended = sorted((run for run in runs if run.result is not None), key=lambda run: run.ended)
@@ -156,16 +157,18 @@ def _cell(runs: Sequence[_Run], all_runs: Sequence[_Run]) -> TaskCell:
         num_seeds=len(counted),
         run_ids=tuple(run.run_id for run in counted),
         unfinished=tuple(run.run_id for run in runs if run.result is None),
-        differs=_differs(runs[0], all_runs),
+        differs={key: value for key, value in sorted(runs[0].settings.items()) if len(values[key]) > 1},
     )
 
 
-def _differs(run: _Run, runs: Sequence[_Run]) -> dict[str, Any]:
-    """Those settings of a run that others of its method with the same primitives have otherwise."""
-    others = [other.settings for other in runs if other.made == run.made]
-    return {
-        key: value for key, value in sorted(run.settings.items()) if any(other.get(key) != value for other in others)
-    }
+def _values(runs: Sequence[_Run]) -> dict[tuple[str, str | None], dict[str, set[str]]]:
+    """All values of each setting, as text, by method and primitives; of a run that lacks one it is None."""
+    found: dict[tuple[str, str | None], dict[str, set[str]]] = {}
+    for made in {run.made for run in runs}:
+        settings = [run.settings for run in runs if run.made == made]
+        keys = {key for each in settings for key in each}
+        found[made] = {key: {repr(each.get(key)) for each in settings} for key in keys}
+    return found
 
 
 def _first(row: Mapping[Column, Sequence[_Run]]) -> _Run:

@@ -240,6 +240,10 @@ class RunReader(ABC):
         """The records of iterations above ``after_iteration``, in order, each iteration once (a resumed run's last)."""
 
     @abstractmethod
+    def newest(self, run_id: str) -> Record | None:
+        """The newest record; None before the first. Fast, however long the run is."""
+
+    @abstractmethod
     def columns(self, run_id: str, names: Sequence[str] | None) -> Columns:
         """These metrics of all iterations, None for all metrics; those that the run does not have are left out."""
 

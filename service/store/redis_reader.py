@@ -55,6 +55,13 @@ class RedisReader(RunReader):
         return [record for record in map(parse_record, lines) if record is not None]
 
     @override
+    def newest(self, run_id: str) -> Record | None:
+        self.run(run_id)  # or raise UnknownRunError
+        with self._address.errors():
+            lines = self._client.zrange(run_key(run_id, "metrics"), -1, -1)
+        return parse_record(lines[0]) if lines else None
+
+    @override
     def columns(self, run_id: str, names: Sequence[str] | None) -> Columns:
         table = Table()
         for record in self.metrics(run_id):

@@ -104,6 +104,12 @@ class RecordFile:
                 kept = _read_from(file, 0)
         return [record for record in kept if _iteration(record) > iteration]
 
+    def newest(self) -> Record | None:
+        """The last record."""
+        with self._open() as file:
+            kept = _read_from(file, max(0, file.seek(0, 2) - _TAIL_BYTES))
+        return kept[-1] if kept else None
+
     def sample(self, name: str, number: int) -> list[float | None]:
         """A metric of about ``number`` records, evenly over the file and with the last, without reading the others."""
         found: dict[int, Record] = {}

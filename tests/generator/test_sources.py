@@ -57,9 +57,14 @@ def test_goals_are_its_own_and_in_the_workspace(file):
     ("old", "new", "said"),
     [
         ("return goal[known", "return goal[:, 0][known", "corner.py: Corner.goals gave float64 of shape ("),
-        ("[0.05, 0.05, 0.025], [0.3", "[1.05, 0.05, 0.025], [1.3", "no goal of it is in the workspace"),
+        (
+            "[0.05, 0.05, 0.025], [0.3",
+            "[1.05, 0.05, 0.025], [1.3",
+            "it gives no goal in the workspace while nothing is known",
+        ),
         ("known.near(", "known.far(", "corner.py:8: AttributeError: "),
-        ("(learnability > 0.0)", "np.nan", "Corner.weights gave a number that is not finite"),
+        ("(learnability > 0.0)", "np.nan", "Corner.weights gave nan at [0] of shape ("),
+        ("(learnability > 0.0)", "0.0 * learnability", "all of its weights are 0 while nothing is known"),
         ("(learnability > 0.0)", "-learnability", "Corner.weights gave numbers below 0"),
         ("(learnability > 0.0)", "learnability[:, None]", "Corner.weights gave float64 of shape ("),
         ("def goals", "def gaols", "corner.py: TypeError: Can't instantiate abstract class Corner"),

@@ -116,6 +116,33 @@ def test_a_key_of_one_method_is_unknown_to_another(file, method, key, said):
     assert_one_line(error.value, "unknown key", said)
 
 
+@pytest.mark.usefixtures("default_signals")
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("def step", "def steps", "mine.py:37: TypeError: Can't instantiate abstract class Climb"),
+        ("self.rng.random()", "self.rng.radnom()", "mine.py:14: AttributeError: "),
+        ("Iteration(self.count(10) | {", "dict(self.count(10) | {", "mine.py: step gave a dict; give an Iteration"),
+        ("count(10)", "count(0)", "mine.py: an iteration made no env steps; say how many with self.count(NUMBER)"),
+        ('"evaluation/height": self.height', '"evaluation/height": 1 / 0', "mine.py:18: ZeroDivisionError: "),
+        ('"rng": self.rng.bit', '"rng": self.rgn.bit', "mine.py:24: AttributeError: "),
+    ],
+)
+def test_an_error_of_the_method_names_its_line(file, tmp_path, old, new, said):
+    assert old in CODE
+    file.write_text(CODE.replace(old, new))
+    with pytest.raises(ConfigError) as error:
+        train(config_of(), RunDirectory(tmp_path / "run"), tmp_path / "registry", on_iteration=ignore)
+    assert_one_line(error.value, said)
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_what_it_measures_that_is_no_number_is_told(file, tmp_path, caplog):
+    file.write_text(CODE.replace('{"evaluation/height": self.height}', '{"evaluation/height": float("nan")}'))
+    train(config_of(), RunDirectory(tmp_path / "run"), tmp_path / "registry", on_iteration=ignore)
+    assert "measured, and no finite number: evaluation/height" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("method", "said"),
     [

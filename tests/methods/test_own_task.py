@@ -8,6 +8,7 @@ from service.config import load_config
 from service.envs.tasks import find_task
 from service.methods import task_check
 from service.methods.task_check import check_task
+from service.registry.bundled import BUNDLED
 from service.registry.loading import load
 from service.registry.publishing import publish
 from service.registry.registry import Registry
@@ -15,6 +16,7 @@ from service.runs.resuming import resumed_config
 from service.runs.train import train
 from service.store.run_directory import RunDirectory
 from tests.cli.typed import tandem
+from tests.envs.test_meshes import write_box
 from tests.runs.runs import KilledError, assert_one_line, assert_same_run
 
 pytestmark = pytest.mark.usefixtures("default_signals", "no_video")
@@ -98,6 +100,38 @@ def test_it_is_trained_killed_resumed_evaluated_and_published(file, tmp_path, ca
     told, code = evaluated(version, registry, "--run-task-code")
     assert "of Stay near (its own), 8 steps, success as the task says" in told
     assert code == 0
+
+
+def test_a_mesh_of_its_world_is_recorded_as_it_was_when_the_run_began(file, tmp_path, monkeypatch):
+    write_box(tmp_path / "brick.obj", (0.06, 0.04, 0.04))
+    world = '    world={"object": {"shape": "mesh", "mesh": {"pieces": ["brick.obj"]}}},\n    episode_steps'
+    file.write_text(CODE.replace("    episode_steps", world))
+    registry, path = tmp_path / "registry", tmp_path / "run"
+    train(begun(registry), RunDirectory(path), registry, publish=False, on_iteration=lambda _: None)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert load(str(path), registry).on(None).world.shape.extent_m == pytest.approx((0.06, 0.04, 0.04))
+    write_box(tmp_path / "brick.obj", (0.1, 0.02, 0.02))
+    code, told = evaluated(path, registry)[::-1]
+    assert "brick.obj" in told
+    assert code == 2
+
+
+def test_primitives_that_moved_are_named_at_a_resume(file, tmp_path):
+    registry = tmp_path / "registry"
+    load("panda-cube@champion", registry)
+    exported = tmp_path / "primitives"
+    Registry(BUNDLED).export("panda-cube@champion", exported)
+    config = begun(registry, f"primitives={exported}")
+    train(config, RunDirectory(tmp_path / "run"), registry, publish=False, on_iteration=lambda _: None)
+    exported.rename(tmp_path / "moved")
+    directory = RunDirectory(tmp_path / "run")
+    overrides = [f"primitives={tmp_path / 'moved'}", "run.total_env_steps=256"]
+    done = train(
+        resumed_config(directory, overrides), directory, registry, resume=True, publish=False,
+        on_iteration=lambda _: None,
+    )  # fmt: skip
+    assert done.num_env_steps == 256
 
 
 def test_hindsight_pays_as_the_task_does(file, tmp_path):

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import re
 import subprocess
 import sys
@@ -344,3 +345,13 @@ def test_a_registry_that_cannot_be_one_is_refused_before_anything_is_learned(tmp
         with pytest.raises(RegistryError, match=r"learn.yaml is no directory; name another with --registry"):
             Registry(root).check_writable()
     Registry(tmp_path / "not" / "there" / "yet").check_writable()
+
+
+def test_a_registry_in_which_only_another_user_may_publish_is_refused(
+    registry: Registry, publish: Publish, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish()
+    registry.check_writable()
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "sha256")  # root may do everything
+    with pytest.raises(RegistryError, match="sha256 is not writable"):
+        registry.check_writable()

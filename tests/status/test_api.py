@@ -1,6 +1,7 @@
 """The answer of each route."""
 
 import json
+from datetime import UTC, datetime, timedelta
 
 import httpx
 import numpy as np
@@ -26,6 +27,14 @@ def test_runs_newest_start_first(client):
     answer = client.get("/v1/runs").json()
     assert [run["run_id"] for run in answer["runs"]] == ["cube", "old"]
     assert answer["num_runs"] == 2
+
+
+def test_the_limit_hides_no_active_run(tmp_path):
+    write_status(tmp_path / "runs", "cube")
+    write_status(tmp_path / "runs", "newer", state="finished", started=datetime.now(UTC) + timedelta(hours=1))
+    with serve(tmp_path) as server, httpx.Client(base_url=server.url, headers=BEARER, **CLIENT) as client:
+        answer = client.get("/v1/runs?limit=1").json()
+    assert [run["run_id"] for run in answer["runs"]] == ["cube"]
 
 
 @pytest.mark.parametrize(
@@ -136,7 +145,7 @@ def test_the_lineage_of_an_orchestrator(tmp_path):
     fields = {"normalisation": {}, "config": {}, "metrics": {}}
     spaces = {"kind": "orchestrator", "primitives": "panda-cube@6"}
     registry.publish("push", {"gate.weight": np.zeros(2, np.float32)}, spaces=spaces, **fields)
-    (version,) = Shelf(registry).versions("push")
+    (version,) = Shelf(registry).versions("push", limit=2)
     assert (version.kind, version.primitives) == ("orchestrator", "panda-cube@6")
 
 

@@ -78,6 +78,13 @@ def test_new_records_and_changes_are_sent(root, service):
         assert take(heard, "status")[0][1]["iteration"] == 5
 
 
+def test_a_stream_begins_with_the_newest_record_also_without_a_status(root, service):
+    (root / "cube" / "config.yaml").touch()
+    (root / "cube" / "status.json").unlink()
+    with listening(service[1]) as heard:
+        assert take(heard, "metrics", "status")[0] == ("metrics", record(3), "3")
+
+
 def test_the_stream_ends_with_the_run(root, service):
     with listening(service[1]) as heard:
         take(heard, "metrics", "status")

@@ -110,11 +110,13 @@ def test_records_after_an_iteration_and_nothing_yet(store):
     assert store.reader.runs() == []
     tell(store)
     assert store.reader.metrics("cube") == []
+    assert store.reader.newest("cube") is None
     assert store.reader.sample("cube", "x", 5) == []
     assert store.reader.goals("cube") is None
     tell(store, records=[a_record(number) for number in range(1, 8)])
     assert [each["iteration"] for each in store.reader.metrics("cube", after_iteration=4)] == [5, 6, 7]
     assert store.reader.metrics("cube", after_iteration=7) == []
+    assert store.reader.newest("cube") == a_record(7)
 
 
 def test_metrics_in_columns_and_a_sample_of_one(store):

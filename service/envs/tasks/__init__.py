@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from importlib import import_module
+from typing import Any
 
 from service.base.errors import TandemError, did_you_mean
 from service.base.user_code import find, parse_reference, recorded
@@ -25,12 +26,13 @@ TASKS = (*PAPERS, "hard-larger", "hard-inair", "hard-push", "hard-box")
 so their difficulty is not known, and they are left out."""
 
 
-def find_task(name: str, code: Mapping[str, str] | None = None) -> Task:
+def find_task(name: str, code: Mapping[str, str] | None = None, world: Mapping[str, Any] | None = None) -> Task:
     """Find a task by its name, or in a file of a user's.
 
     Args:
         name: one of ``TASKS``; or ``FILE.py``, ``FILE.py:NAME`` or ``MODULE:NAME``.
         code: texts that a run has recorded, by origins; a file that is not among them is read.
+        world: the settings of its world that a run has recorded, of a user's.
 
     Raises:
         TandemError: no such task, or a file that has none.
@@ -44,7 +46,8 @@ def find_task(name: str, code: Mapping[str, str] | None = None) -> Task:
         )
     texts = recorded(name, code or {})
     task: Task = find(reference, texts, lambda each: isinstance(each, Task), "task")
-    return replace(task, name=name, code={reference.origin: texts[reference.origin]})
+    task = replace(task, name=name, code={reference.origin: texts[reference.origin]})
+    return task if world is None else replace(task, world=world)
 
 
 @cache
