@@ -40,11 +40,14 @@ $(VENV)/bin/uv:
 	@$(PYTHON) -m venv $(VENV)
 	@$(PIP) -c constraints.txt uv
 
+# As a path, which type checkers follow, and not by a hook of Python's import, which they do not.
+EDITABLE = -e '.[dev]' --config-settings editable_mode=compat
+
 # uv takes seconds where pip takes a minute; pip is there for machines whose indexes only it knows. Bytecode is compiled here, as
 # pip does: where Python may not write it later (PYTHONDONTWRITEBYTECODE), every process would take 2 s more to import torch.
 $(STAMP): pyproject.toml constraints.txt | $(VENV)/bin/uv
-	@$(VENV)/bin/uv pip install -q --compile-bytecode --python $(PY) $(uv_flags) -c constraints.txt -e '.[dev]' \
-	  || { echo "uv could not install it; trying pip, which takes longer ..."; $(PIP) -c constraints.txt -e '.[dev]'; }
+	@$(VENV)/bin/uv pip install -q --compile-bytecode --python $(PY) $(uv_flags) -c constraints.txt $(EDITABLE) \
+	  || { echo "uv could not install it; trying pip, which takes longer ..."; $(PIP) -c constraints.txt $(EDITABLE); }
 	@touch $@
 
 demo: $(STAMP)
