@@ -51,7 +51,8 @@ def highest(places: StateArray, world: WorldConfig) -> StateArray:
 
 ONE_MOVED, SEVERAL_MOVED, STACKED = range(3)
 """Arrangements: one object is elsewhere than at the start, several are, or one rests on another."""
-NUM_ARRANGEMENTS = 3
+ARRANGEMENT_NAMES = ("one", "several", "stacked")
+NUM_ARRANGEMENTS = len(ARRANGEMENT_NAMES)
 _STACKED_WITHIN_M = 0.01, 0.025
 """Up and sideways, of the place where the middle of one is exactly above the other's."""
 

@@ -110,6 +110,11 @@ class DifficultyGrid:
         self.counts.record(tries, successes)
         return self.num_cells_seen - before
 
+    @property
+    def seen_by_object(self) -> BoolArray:
+        """(K, cells of one object) whether a valid goal of it was ever proposed there."""
+        return self.seen.reshape(self.cells.num_objects, -1)
+
     def near_reached(self) -> BoolArray:
         """(cells,) whether a cell was reached, or shares a face with one that was."""
         reached = self.reached.reshape(self.cells.num_objects, *self.cells.shape)

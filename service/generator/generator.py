@@ -93,7 +93,7 @@ class TaskGenerator:
 
     def snapshot(self) -> GeneratorSnapshot:
         """All that rollout workers need to choose goals in the next round; a copy."""
-        coverage = self.grid.seen.mean()
+        coverage = self.grid.seen_by_object.mean(axis=1)  # what is known of one object makes another no less new
         return GeneratorSnapshot(
             config=self._config,
             cells=self.cells,
@@ -102,10 +102,10 @@ class TaskGenerator:
             starts=self.starts.rows(),
             held_starts=self.held_starts.rows(),
             learnability=self.difficulty.learnability(),
-            novelty=novelty(self.grid.proposals) * (1.0 - coverage),
+            novelty=novelty(self.grid.proposals) * np.repeat(1.0 - coverage, len(self.cells) // len(coverage)),
             novelty_of_arrangements=novelty(self.grid.arranged),
             success_rate=np.array(self.grid.mean_success_rate()),
-            coverage=np.array(coverage),
+            coverage=np.array(self.grid.seen.mean()),
             near_reached=self.grid.near_reached(),
         )
 
@@ -137,6 +137,9 @@ class TaskGenerator:
             "generator/mean_learnability": self.grid.mean_learnability(),
             "generator/mean_success_rate": self.grid.mean_success_rate(),
         }
+        if self.cells.num_objects > 1:
+            for number, seen in enumerate(self.grid.seen_by_object, start=1):
+                metrics[f"generator/num_cells_seen_object_{number}"] = float(np.count_nonzero(seen))
         return {name: value for name, value in metrics.items() if not np.isnan(value)}
 
     def add_opponents(self, iteration: int, alice: Mapping[str, Array], bob: Mapping[str, Array]) -> None:

@@ -16,8 +16,10 @@ from service.base.types import Array, BoolArray, IntArray, Metrics, StateArray
 from service.config import WorldConfig
 from service.envs.observations import distances, each_object
 from service.generator.bins import (
+    ARRANGEMENT_NAMES,
     HEIGHT_NAMES,
     NUM_ARRANGEMENTS,
+    ONE_MOVED,
     GoalCells,
     TaskBins,
     height_bins,
@@ -238,6 +240,8 @@ def summarize(
     sums = alice_sums(records, tasks.world) | bob_sums(records, tasks.world)
     if tasks.some_blocked:
         sums |= _blocked_sums(records, tried, tasks.blocked(records.start_state))
+    if tasks.world.num_objects > 1:
+        sums |= _sums_by_object(records, tried, proposed_from, tasks)
     kept = _some(np.flatnonzero(records.own), max_goals, rng)
     begins: BoolArray = records.round_index == 0
     began = _some(np.flatnonzero(begins), max_starts, rng)
@@ -286,6 +290,24 @@ def _join_sums(sums: Sequence[Sums]) -> Sums:
 def _blocked_sums(records: GoalRecords, tried: BoolArray, blocked: BoolArray) -> Sums:
     valid: BoolArray = records.verdict[blocked & ~records.alice_past & ~records.replayed] == Verdict.VALID
     return sum_up({"alice/valid_fraction_blocked": valid, "bob/success_rate_blocked": records.solved[tried & blocked]})
+
+
+def _sums_by_object(records: GoalRecords, tried: BoolArray, proposed_from: StateArray, tasks: TaskBins) -> Sums:
+    """Of several objects: Bob's success at whatever he tried, and Alice's valid goals, by arrangement and object."""
+    valid, solved = _valid(records), records.solved[tried]
+    goal, start = records.goal[tried], records.start_position[tried]
+    asked, moved = tasks.arrangements(goal, start), distances(goal, start).argmax(axis=1)
+    shown, place = (
+        tasks.arrangements(records.proposal[valid], proposed_from[valid]),
+        each_object(records.proposal[valid]),
+    )
+    cases: dict[str, Array] = {}
+    for kind, name in enumerate(ARRANGEMENT_NAMES):
+        cases |= {f"bob/success_rate_{name}": solved[asked == kind], f"alice/{name}_fraction": shown == kind}
+    for index, rest_height_m in enumerate(tasks.world.rest_heights_m):
+        cases[f"bob/success_rate_object_{index + 1}"] = solved[(asked == ONE_MOVED) & (moved == index)]
+        cases[f"alice/lifted_fraction_object_{index + 1}"] = in_air(place[:, index], rest_height_m)
+    return sum_up(cases)
 
 
 def _some(rows: IntArray, num: int, rng: np.random.Generator) -> IntArray:

@@ -11,6 +11,7 @@ from service.envs.observations import distances
 from service.envs.sampling import are_apart
 from service.envs.scene import build_layout
 from service.generator.bins import (
+    ARRANGEMENT_NAMES,
     NUM_TASK_BINS,
     ONE_MOVED,
     SEVERAL_MOVED,
@@ -26,7 +27,7 @@ from service.generator.records import of_furthest, summarize
 from service.generator.snapshot import _one_stays
 from service.generator.validity import Verdict, classify_goal, proposed
 from service.methods.method import goal_grid
-from tests.generator.outcomes import make_records
+from tests.generator.outcomes import make_records, record
 
 CONFIG = parse_config(
     {"world": {"objects": ["cube", "cube"]}, "generator": {"goal_source": "reached", "replay_invalid": True}},
@@ -255,3 +256,43 @@ def test_a_stack_is_as_rare_when_she_has_been_everywhere():
     assert snapshot.coverage == 1.0
     assert not snapshot.novelty.any()
     assert snapshot.novelty_of_arrangements.tolist() == [1.0, 1.0, 1.0]
+
+
+KINDS = tuple(f"{end}{name}{more}" for name in ARRANGEMENT_NAMES for end, more in (("_", ""), ("/", "_fraction")))
+
+
+def test_success_and_goals_by_arrangement_and_object_by_hand():
+    on_the_other = (0.15, 0.0, 0.05)  # the first, from x = -0.1, to above the second at x = 0.05
+    goals = np.array([
+        moved((0.1, 0.1, 0.0)),
+        moved((0.1, 0.1, 0.1)),
+        moved(second=(0.0, 0.1, 0.0)),
+        moved((0.1, 0.1, 0.0), (0.0, 0.1, 0.1)),
+        moved(on_the_other),
+    ])  # fmt: skip
+    num = len(goals)
+    states = np.zeros((num, LAYOUT.size))
+    solved = [True, False, True, True, False]
+    records = make_records(
+        goals, start_position=np.tile(START, (num, 1)), start_state=states, solved=solved, round_index=np.zeros(num)
+    )
+    generator = TaskGenerator(CONFIG, LAYOUT)
+    metrics = record(generator, records)
+    found = {name: value for name, value in metrics.items() if "object" in name or name.endswith(KINDS)}
+    assert found == pytest.approx({
+        "bob/success_rate_one": 2 / 3, "bob/success_rate_several": 1.0, "bob/success_rate_stacked": 0.0,
+        "alice/one_fraction": 3 / 5, "alice/several_fraction": 1 / 5, "alice/stacked_fraction": 1 / 5,
+        "bob/success_rate_object_1": 1 / 2, "bob/success_rate_object_2": 1.0,
+        "alice/lifted_fraction_object_1": 1 / 5, "alice/lifted_fraction_object_2": 1 / 5,
+        "generator/num_cells_seen_object_1": 3.0, "generator/num_cells_seen_object_2": 1.0,
+    })  # fmt: skip
+
+
+def test_a_new_cell_of_one_object_is_worth_as_much_however_well_the_other_is_known():
+    generator = TaskGenerator(CONFIG, LAYOUT)
+    before = generator.snapshot().novelty[-1]
+    generator.grid.seen[: len(generator.cells) // 2] = True
+    after = generator.snapshot()
+    assert after.novelty[-1] == before == 1.0
+    assert after.novelty[0] == 0.0
+    assert after.coverage == 0.5
