@@ -244,10 +244,7 @@ class Appender:
                 self._check_same(file)
                 while self._waiting:
                     _write_whole(file, self._waiting[0])
-                    self._written(self._waiting.popleft())
-
-    def _written(self, piece: bytes) -> None:
-        """Called when the file has one more piece."""
+                    self._waiting.popleft()
 
     def _check_same(self, file: FileIO) -> None:
         there = os.fstat(file.fileno())

@@ -6,30 +6,14 @@ A killed run leaves at most one torn line, at the end: readers pass over it. A f
 from __future__ import annotations
 
 import json
-import logging
 import math
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from service.base.errors import StorageError
 from service.base.files import Appender, os_errors, read_regular, write_atomic
 from service.base.parsing import ParseError, parse_json
-
-_logger = logging.getLogger(__name__)
-
-
-class Extent(NamedTuple):
-    """The first bytes of a file: how many they are, and their CRC-32."""
-
-    num_bytes: int = 0
-    crc32: int = 0
-
-    @classmethod
-    def of(cls, data: bytes) -> Extent:
-        """The extent of these bytes."""
-        return cls(len(data), zlib.crc32(data))
 
 
 def plain(value: Any) -> Any:
@@ -65,11 +49,6 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
 class JsonlWriter(Appender):
     """Appends records to one file, a line each, so that a kill loses no record already written."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self.extent = Extent()
-        """Of what the file has got, or was kept by a cut; not of what waits for room."""
-
     def append(self, record: Mapping[str, Any]) -> None:
         """Write ``record``, made `plain`, as the file's last line and hand it to the operating system.
 
@@ -78,29 +57,11 @@ class JsonlWriter(Appender):
         """
         self.append_bytes(json.dumps(plain(record), allow_nan=False).encode() + b"\n")
 
-    def damage(self, extent: Extent) -> str | None:
-        """Compare the beginning of the file with what it once was: what is wrong with it, or None.
-
-        Raises:
-            StorageError: the file cannot be read.
-        """
-        begin = _read(self.path, missing_ok=True)[: extent.num_bytes]
-        if len(begin) < extent.num_bytes:
-            return f"has {len(begin):,} bytes, and had {extent.num_bytes:,} when the checkpoint was saved"
-        if Extent.of(begin) != extent:
-            return f"has other first {extent.num_bytes:,} bytes than were written"
-        return None
-
-    def cut(self, num_bytes: int) -> None:
-        """Keep so many bytes, in one atomic step. A missing file is empty.
-
-        Raises:
-            StorageError: the file cannot be read or written; it is then as it was.
-        """
-        self._replace(_read(self.path, missing_ok=True)[:num_bytes])
-
-    def cut_after(self, iteration: int) -> None:
+    def cut_after(self, iteration: int) -> tuple[int, int]:
         """Keep the records up to an iteration, in one atomic step; lines that are no records in their order go.
+
+        Returns:
+            Number of records that are kept, and of lines that were none.
 
         Raises:
             StorageError: the file cannot be read or written; it is then as it was.
@@ -114,18 +75,10 @@ class JsonlWriter(Appender):
             elif number <= iteration:
                 kept.append(line)
                 newest = number
-        if num_strange:
-            _logger.warning("%s: left out %d lines that are no records in their order", self.path, num_strange)
-        self._replace(b"".join(line + b"\n" for line in kept))
-
-    def _written(self, piece: bytes) -> None:
-        self.extent = Extent(self.extent.num_bytes + len(piece), zlib.crc32(piece, self.extent.crc32))
-
-    def _replace(self, kept: bytes) -> None:
-        self.extent = Extent.of(kept)
         if self.path.exists():
             self.take_new_file()
-            write_atomic(self.path, kept)  # also the same bytes: see Appender
+            write_atomic(self.path, b"".join(line + b"\n" for line in kept))  # also the same bytes: see Appender
+        return len(kept), num_strange
 
 
 def _read(path: Path, *, missing_ok: bool = False) -> bytes:

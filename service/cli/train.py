@@ -149,9 +149,6 @@ def train(
         Path | None, typer.Option(metavar="FILE", help="Its token; default: TANDEM_TOKEN. See tandem serve.")
     ] = None,
     tracker: TrackerOption = None,
-    accept_damaged_records: Annotated[
-        bool, typer.Option("--accept-damaged-records", help="Resume without the records that are missing or changed.")
-    ] = False,
     quiet: QuietOption = False,
 ) -> None:
     """Train what a recipe, a task or a file says, in this process or on a Ray cluster, and publish it."""
@@ -180,7 +177,6 @@ def train(
     for is_so, names, why in (
         (runtime == "local", (*_OF_A_RUN_ON_RAY, *_OF_RAY), "is for a run on Ray: give --runtime ray, or leave it out"),
         (study, _OF_A_RUN_ON_RAY, "is for one run: --set run.num_threads=N says the cores of each run of a study"),
-        (study, ["accept_damaged_records"], "is for one run of a study: resume that one by its --run-dir"),
         (not study, ["parallel"], "is for the runs of a study: give --seeds or --grid, too, or leave it out"),
         (status == "off", ["token_file"], "is for the service that --status off leaves out: drop one of them"),
         (was_typed(context, "run_dir"), ["runs"], "is where --run-dir would be: drop one of them"),
@@ -204,7 +200,7 @@ def train(
     overrides = [*first, *overrides]
     begun = file if file is not None or first else recipes()[DEFAULT_RECIPE]
     run_dir = run_dir or runs / load_config(begun, overrides).directory_name
-    directory = RunDirectory(run_dir, accept_damaged_records=accept_damaged_records)
+    directory = RunDirectory(run_dir)
     if resume == AUTO:
         again = directory.exists
     start = None

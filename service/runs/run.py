@@ -16,7 +16,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from service.base.errors import CheckpointError, ConfigError, DivergedError, TandemError
-from service.base.jsonl import Extent
 from service.base.tensors import split_parts
 from service.base.types import Arrays, Metrics
 from service.base.user_code import CodeError, naming_errors_of, origin_of
@@ -73,7 +72,7 @@ class Run:
         self.checkpoints = CheckpointStore(directory.checkpoints, config.run.keep_checkpoints, epoch=directory.epoch)
         self._snapshots = CheckpointStore(directory.snapshots, keep=sys.maxsize)
         self._saved: int | None = None
-        """The iteration of the newest checkpoint, where the records are as it says; None before the first."""
+        """The iteration of the newest checkpoint; None before the first."""
         self.wall_s = 0.0
         """Seconds spent on iterations, by all processes that ran this run."""
         self._iteration_s = 0.0
@@ -96,8 +95,6 @@ class Run:
                 method.start(state)
                 _logger.info("resumed at iteration %d, %d env steps", self.iteration, self.num_env_steps)
                 directory.start(config, resumption)
-                if self._saved is None:  # records are not as the checkpoint says, and that was accepted
-                    self._save()
             else:
                 method.start()
                 # An untrained run is saved, so that one that is killed before its first interval can be resumed, too.
@@ -231,19 +228,17 @@ class Run:
     # --- saving ----------------------------------------------------------------------------------------------------
 
     def _load(self) -> tuple[Resumption, State]:
-        """Read the newest checkpoint, once it is clear that it is of this run, and that its records are there.
+        """Read the newest checkpoint, once it is clear that it is of this run.
 
         Raises:
             CheckpointError: there is no usable one, or it is of another run or configuration.
-            StorageError: see ``RunDirectory.check_resumable``.
         """
         checkpoint = self.checkpoints.load_latest()
         meta = checkpoint.meta
         changed = changed_settings(meta["config"], self.config, self.directory.path)
-        records = {name: Extent(*extent) for name, extent in meta["records"].items()}
-        resumption = Resumption(checkpoint.step, int(meta["env_steps"]), meta["run"], records, changed)
-        if self.directory.check_resumable(resumption):
-            self._saved = checkpoint.step
+        resumption = Resumption(checkpoint.step, int(meta["env_steps"]), meta["run"], changed)
+        self.directory.check_resumable(resumption)
+        self._saved = checkpoint.step
         if changed:
             said = ", ".join(f"{key} from {was!r} to {now!r}" for key, (was, now) in changed.items())
             _logger.info("changed since iteration %d: %s", checkpoint.step, said)
@@ -261,12 +256,12 @@ class Run:
             with self.naming_errors():
                 arrays, values = flatten(self.method.state())
             directory.check_owner()
+            directory.sync()
             meta = {
                 "env_steps": self.num_env_steps,
                 "wall_s": self.wall_s,
                 "config": self.config.model_dump(mode="json"),
                 "run": directory.history.run,
-                "records": directory.sync(),
                 "state": values,
             }
             with directory.noting(directory.checkpoints):

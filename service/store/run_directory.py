@@ -41,7 +41,7 @@ from pydantic import BaseModel, JsonValue, TypeAdapter
 
 from service.base.errors import CheckpointError, ConfigError, RunTakenError, StorageError, TandemError
 from service.base.files import Appender, os_errors, remove_temporaries, write_atomic
-from service.base.jsonl import Extent, JsonlWriter
+from service.base.jsonl import JsonlWriter
 from service.base.lock import DirectoryLock, claim_epoch, give_back_epoch, newest_epoch
 from service.base.parsing import parse_json
 from service.base.types import FloatArray, StateArray
@@ -95,8 +95,6 @@ class Resumption:
     num_env_steps: int
     run: str
     """Identity of the run that saved it."""
-    records: dict[str, Extent]
-    """What the files of records held then."""
     changed: dict[str, tuple[JsonValue, JsonValue]]
     """Settings that are not as they were then: what they were, and what they are."""
 
@@ -108,12 +106,10 @@ class RunDirectory:
 
     Args:
         path: of the directory.
-        accept_damaged_records: go on with a run whose records are not as they were written, without those.
     """
 
-    def __init__(self, path: Path, *, accept_damaged_records: bool = False) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        self._accept_damaged_records = accept_damaged_records
         self.config_file = path / "config.yaml"
         self.metrics_file = path / "metrics.jsonl"
         self.goals_file = path / "goals.jsonl"
@@ -126,8 +122,6 @@ class RunDirectory:
         self._events: EventFile | None = None
         self._failing: dict[Path, str] = {}
         self._lock: DirectoryLock | None = None
-        self._damaged: dict[str, str] = {}
-        """What is wrong with files of records, by their names, and was accepted."""
         self.history = RunHistory.new()
         """Identity of the run, and what was not as before when a process went on with it; read by ``claim``."""
         self.epoch = 0
@@ -168,21 +162,15 @@ class RunDirectory:
         with os_errors("write", self.path):
             self.checkpoints.mkdir(parents=True, exist_ok=True)
             remove_temporaries(self.path)
-        for writer in (self._metrics, self._goals):
-            if resumption is None:
-                writer.cut(0)
-            elif writer.path.name in self._damaged:
-                writer.cut_after(resumption.iteration)
-            else:
-                writer.cut(resumption.records[writer.path.name].num_bytes)
+        lost = self._cut_records(resumption.iteration if resumption is not None else 0)
         after_step = resumption.num_env_steps if resumption is not None else None
         self._events = EventFile(self.path / "tensorboard", after_step=after_step)
-        if resumption is not None and (resumption.changed or self._damaged):
+        if resumption is not None and (resumption.changed or lost):
             event = Event(
                 at=datetime.now(UTC),
                 after_iteration=resumption.iteration,
                 changed=resumption.changed,
-                damaged_records=tuple(f"{name} {what}" for name, what in self._damaged.items()),
+                damaged_records=lost,
             )
             self.history = self.history.model_copy(update={"events": (*self.history.events, event)})
         self.history.write(self.path)
@@ -257,35 +245,32 @@ class RunDirectory:
                 f"{self.path} was taken over by another process; this one stops, and what it did since then is not kept"
             )
 
-    def check_resumable(self, resumption: Resumption) -> bool:
-        """Check that a checkpoint is of this run, and that the records still are what they were when it was saved.
-
-        Returns:
-            Whether the records are; if not, that is accepted, and ``start`` keeps those that can be read.
+    def check_resumable(self, resumption: Resumption) -> None:
+        """Check that a checkpoint is of this run.
 
         Raises:
             CheckpointError: it is of another run.
-            StorageError: records are damaged and that is not accepted, or they cannot be read.
         """
         if self.history.run != resumption.run:
             raise CheckpointError(
                 f"{self.path}: its newest checkpoint is of another run ({resumption.run[:8]}, not "
                 f"{self.history.run[:8]}); put that of this run back"
             )
-        found = {
-            each.path.name: each.damage(resumption.records[each.path.name]) for each in (self._metrics, self._goals)
-        }
-        self._damaged = {name: damage for name, damage in found.items() if damage is not None}
-        if not self._damaged:
-            return True
-        said = "; ".join(f"{self.path / name} {what}" for name, what in self._damaged.items())
-        if not self._accept_damaged_records:
-            raise StorageError(
-                f"{said}: restore it from a copy, or go on with those records that can be read by "
-                "--accept-damaged-records"
-            )
-        _logger.warning("%s; going on with those records that can be read", said)
-        return False
+
+    def _cut_records(self, iteration: int) -> tuple[str, ...]:
+        """Keep the records up to an iteration, and say what is lost of them that was not lost before."""
+        lost = []
+        for writer in (self._metrics, self._goals):
+            num_kept, num_strange = writer.cut_after(iteration)
+            if num_strange:
+                lost.append(f"{writer.path.name}: lines that were no records: {num_strange}")
+            if writer is self._metrics and num_kept < iteration:
+                lost.append(f"{writer.path.name}: iterations that it lacks: {iteration - num_kept}")
+        known = {text for event in self.history.events for text in event.damaged_records}
+        new = tuple(text for text in lost if text not in known)
+        for text in new:
+            _logger.warning("%s: %s; the run goes on without them", self.path, text)
+        return new
 
     def _check_free(self) -> None:
         if self.path.exists() and not self.path.is_dir():
@@ -333,12 +318,11 @@ class RunDirectory:
             np.savez(data, states=np.stack(states), actions=np.stack(actions))
             write_atomic(path, data.getvalue())
 
-    def sync(self) -> dict[str, Extent]:
-        """Wait until the disk has every record, and say what there is: a checkpoint must not know more than they do."""
+    def sync(self) -> None:
+        """Wait until the disk has every record: a checkpoint must not be ahead of them."""
         for writer in self._writers():
             with self.keep_running(writer.path):
                 writer.sync()
-        return {writer.path.name: writer.extent for writer in (self._metrics, self._goals)}
 
     def close(self) -> None:
         """Write what still waits for room on the disk, and let other processes in.

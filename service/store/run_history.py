@@ -28,7 +28,7 @@ class Event(FrozenModel):
     at: AwareDatetime
     after_iteration: int = Field(ge=0)
     changed: dict[str, tuple[JsonValue, JsonValue]] = Field({}, description="settings: what they were, what they are")
-    damaged_records: tuple[str, ...] = Field((), description="records that are lost, and were accepted as lost")
+    damaged_records: tuple[str, ...] = Field((), description="what is lost of the records")
 
 
 class RunHistory(FrozenModel):

@@ -120,7 +120,6 @@ def test_what_is_like_nothing_gets_no_guess():
         ),
         (["--runs", "a", "--run-dir", "b"], "--runs is where --run-dir would be: drop one of them"),
         (["--runtime", "ray", "--status", "off", "--token-file", "x"], "--token-file is for the service that"),
-        (["--seeds", "0,1", "--accept-damaged-records"], "resume that one by its --run-dir"),
         (["--run-id", "x", "--resume"], "--resume is what --run-id says already"),
         (["--run-id", "x", "--run-dir", "y"], "--run-dir is what --run-id says already"),
         (["--resume", "--run-dir", "x", "--from", "panda-cube"], "--from is for a run that begins"),
