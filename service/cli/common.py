@@ -72,9 +72,10 @@ SOURCE = "registry"
 REFERENCE = "NAME@ALIAS|PATH"
 """What ``load`` takes, as help has it."""
 ReferenceArgument = Annotated[
-    str | None,
+    str,
     typer.Argument(
         metavar=REFERENCE,
+        show_default=False,
         help=f"A version, or the path of a run, a checkpoint or an exported version. Default: {CHAMPION}.",
     ),
 ]
@@ -142,14 +143,6 @@ def choose(option: str, name: str, known: Iterable[str]) -> str:
 RunCodeOption = Annotated[
     bool, typer.Option("--run-task-code", help="Run the code that a published policy's own task brings.")
 ]
-
-
-def what_is_meant(reference: str | None, primitives: str | None) -> tuple[str, str | None]:
-    """The reference of a command, and what that acts with, if that was typed.
-
-    Until version 0.2 the reference itself was typed as ``--primitives``.
-    """
-    return (reference, primitives) if reference is not None else (primitives or CHAMPION, None)
 
 
 def was_typed(context: typer.Context, name: str) -> bool:

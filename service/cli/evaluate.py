@@ -15,6 +15,7 @@ import typer
 from service.base.errors import TandemError, in_metres, one_line
 from service.base.files import check_place, write_atomic
 from service.cli.common import (
+    CHAMPION,
     SOURCE,
     ActsWithOption,
     JsonOption,
@@ -26,7 +27,6 @@ from service.cli.common import (
     choose,
     loading,
     print_json,
-    what_is_meant,
 )
 from service.config import WorldConfig, changed_config
 from service.config.find import METHODS
@@ -55,7 +55,7 @@ _SIZES = (64, 4096)
 
 
 def evaluate(
-    reference: ReferenceArgument = None,
+    reference: ReferenceArgument = CHAMPION,
     task: TaskOption = None,
     method: Annotated[
         str | None,
@@ -96,7 +96,6 @@ def evaluate(
     for override in overrides or ():
         if not override.startswith("world."):
             raise TandemError(f"--set {one_line(override, 200)}: of an evaluation only the world can be set, world.A=B")
-    reference, primitives = what_is_meant(reference, primitives)
     with loading():
         from service.actors.evaluation import evaluate as run
         from service.envs.sampling import GOAL_KINDS
@@ -193,12 +192,11 @@ def _write_result(path: Path, trained: Trained, method: str | None, seed: int, n
 
 
 def coverage(
-    reference: ReferenceArgument = None,
+    reference: ReferenceArgument = CHAMPION,
     skills: Annotated[int, typer.Option(help="Number of random compositions, or skills.", min=1)] = 32,
     steps: Annotated[int, typer.Option(help="Steps each.", min=1)] = 100,
     seed: _Seed = 0,
     out: Annotated[Path, typer.Option(metavar="FILE", help="Picture to write.")] = Path("coverage.png"),
-    primitives: Annotated[str | None, typer.Option("--primitives", hidden=True)] = None,
     as_json: JsonOption = False,
     registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
@@ -207,7 +205,6 @@ def coverage(
     check_place(out)
     if out.suffix.lower() != ".png":
         raise TandemError(f"--out {out}: the picture is a PNG; name a file that ends in .png")
-    reference, _ = what_is_meant(reference, primitives)
     with loading():
         from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
         from service.media.artifacts import paths_of
@@ -230,7 +227,7 @@ def coverage(
 
 
 def render(
-    reference: ReferenceArgument = None,
+    reference: ReferenceArgument = CHAMPION,
     task: TaskOption = None,
     episodes: Annotated[int, typer.Option(help="Rounds, episodes or skills to record.", min=1, max=64)] = 4,
     goals: GoalsOption = None,
@@ -251,7 +248,6 @@ def render(
     quiet: QuietOption = False,
 ) -> None:
     """Make a film of a run's Alice beside its Bob, of a policy on goals or on its task, or of random skills."""
-    reference, primitives = what_is_meant(reference, primitives)
     with loading():
         from service.media.artifacts import film
         from service.methods.task_evaluation import FINAL_SEED

@@ -11,6 +11,7 @@ import typer
 
 from service.base.errors import StatusError, needs_extra
 from service.cli.common import (
+    CHAMPION,
     REGISTRY,
     SOURCE,
     ActsWithOption,
@@ -21,7 +22,6 @@ from service.cli.common import (
     SourceOption,
     TaskOption,
     loading,
-    what_is_meant,
 )
 from service.registry.registry import Registry
 from service.registry.token import VARIABLE, read_token
@@ -61,7 +61,7 @@ def serve(
 
 
 def play(
-    reference: ReferenceArgument = None,
+    reference: ReferenceArgument = CHAMPION,
     task: TaskOption = None,
     host: Annotated[
         str, typer.Option(help="Where to listen; on others than this machine's, all who reach it play along.")
@@ -77,7 +77,6 @@ def play(
 
     A run that goes on is followed: its newest Bob acts, and the page says how far it is.
     """
-    reference, primitives = what_is_meant(reference, primitives)
     with loading():
         from service.registry.loading import load
         from service.robot.play.following import Following, is_running

@@ -243,7 +243,7 @@ def _goals_of(
         if kind == "table":
             return table
         lowest = rest_m + (success_distance_m if kind == "air" else 0.0)
-        volume = sample_in_volume(rng, num, config.workspace, 2 * rest_m, lowest_m=lowest)
+        volume = sample_in_volume(rng, num, config.workspace, lowest_m=lowest)
         if kind != "mixed":
             return volume
         return np.where(rng.random((num, 1)) < MIXED_AIR_SHARE, volume, table)
@@ -284,11 +284,9 @@ def apart(goal: StateArray, config: WorldConfig) -> BoolArray:
     return found
 
 
-def sample_in_volume(
-    rng: np.random.Generator, num: int, workspace: WorkspaceConfig, object_height_m: float, *, lowest_m: float
-) -> StateArray:
+def sample_in_volume(rng: np.random.Generator, num: int, workspace: WorkspaceConfig, *, lowest_m: float) -> StateArray:
     """(num, 3) object centres, uniform in the workspace above ``lowest_m``."""
-    position = sample_on_table(rng, num, workspace, object_height_m)
+    position = sample_on_table(rng, num, workspace, 0.0)
     position[:, 2] = rng.uniform(lowest_m, workspace.height_m, num)
     return position
 

@@ -86,11 +86,10 @@ def model_card(manifest: Manifest, *, licence: str = LICENCE) -> str:
         "parameters": f"{sum(prod(each.shape) for each in manifest.tensors.values()):,}",
         "sha256 of the parameters": f"`{manifest.blob_sha256}`",
     }
-    seed = config.get("seed")
     training = {
         "env steps": f"{metrics['env_steps']:,.0f}" if "env_steps" in metrics else None,
         "method": spaces.get("method") or _at(config, "skills", "method"),
-        "seed": seed if seed is not None else _at(config, "trial", "seed"),
+        "seed": config.get("seed"),
         "trained on from": f"`{manifest.parent}`" if manifest.parent else None,
         "published": manifest.created,
         "code": f"commit `{manifest.git_commit}`" if manifest.git_commit else None,

@@ -68,7 +68,7 @@ def create_app(
     *,
     token: str | None,
     public: bool,
-    runs_dir: Path | None = None,
+    runs_dir: Path,
 ) -> FastAPI:
     """Make the app with the REST API, ``/metrics`` and the web page.
 

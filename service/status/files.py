@@ -49,9 +49,9 @@ def kind_of(name: str) -> tuple[str, str]:
 
 
 class RunDirectories:
-    """Pictures and videos in the run directories of ``root``; None if runs have no directories on this machine."""
+    """Pictures and videos in the run directories of ``root``."""
 
-    def __init__(self, root: Path | None) -> None:
+    def __init__(self, root: Path) -> None:
         self._root = root
         self._found: dict[str, Path] = {}
         """Of the last listing."""
@@ -96,7 +96,7 @@ class RunDirectories:
     def directories(self) -> dict[str, Path]:
         """The directories of runs that are on this machine, by their ids."""
         try:
-            self._found = run_directories(self._root) if self._root is not None else {}
+            self._found = run_directories(self._root)
         except OSError:
             return {}
         return self._found

@@ -47,7 +47,7 @@ class StatusServer:
         token: str | None = None,
         host: str = "127.0.0.1",
         port: int = DEFAULT_PORT,
-        runs_dir: Path | None = None,
+        runs_dir: Path,
     ) -> None:
         self._socket = _listen(host, port)
         address, self.port = self._socket.getsockname()[:2]

@@ -47,7 +47,7 @@ NO_CONTENT = {
     "nothing": b"",
     "lines for a terminal": b'name: "x\\nTraceback (most recent call last):\\n\\e[2J"',
 }
-EVALUATE = ("evaluate", "--episodes", "2", "--steps", "2", "--registry", "registry", "--primitives")
+EVALUATE = ("evaluate", "--episodes", "2", "--steps", "2", "--registry", "registry")
 RESUME = ("pretrain", "--resume", "--registry", "registry", "--run-dir")
 CHECKPOINT = "run/checkpoints/*"
 VERSION, BLOB = "registry/models/tiny/versions/1", "registry/blobs/*/*"

@@ -57,7 +57,7 @@ def place_in_air(config, num_worlds, *, seed, num_threads=2):
     rng = np.random.default_rng(seed)
     with WorldBatch(config, num_worlds, num_threads=num_threads) as worlds:
         worlds.reset(rng)
-        goal = sample_in_volume(rng, num_worlds, config.workspace, 2 * config.rest_height_m, lowest_m=_LOWEST_GOAL_M)
+        goal = sample_in_volume(rng, num_worlds, config.workspace, lowest_m=_LOWEST_GOAL_M)
         grasp(worlds)
         grasped = worlds.contacts().all(axis=1)
 

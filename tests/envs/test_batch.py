@@ -183,7 +183,7 @@ class TestSampling:
     WORKSPACE = WorkspaceConfig(center_x_m=-0.1, center_y_m=0.05, length_x_m=0.2, length_y_m=0.4, height_m=0.3)
 
     def test_in_the_volume(self):
-        found = sample_in_volume(np.random.default_rng(0), 4000, self.WORKSPACE, 0.06, lowest_m=0.08)
+        found = sample_in_volume(np.random.default_rng(0), 4000, self.WORKSPACE, lowest_m=0.08)
         assert_uniform(found[:, 0], -0.2, 0.0)
         assert_uniform(found[:, 1], -0.15, 0.25)
         assert_uniform(found[:, 2], 0.08, 0.3)

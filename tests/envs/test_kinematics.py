@@ -134,7 +134,7 @@ def assert_reached(arm, joints, target, tolerance_m):
     ids=["pre-training", "larger"],
 )
 def test_inverse_reaches_the_workspace(arm, workspace, least_share):
-    target = sample_in_volume(np.random.default_rng(1), 2000, workspace, 0.05, lowest_m=PANDA.lowest_m)
+    target = sample_in_volume(np.random.default_rng(1), 2000, workspace, lowest_m=PANDA.lowest_m)
     within = np.linalg.norm(reach_of(PANDA, arm).clip(target) - target, axis=1) < 1e-9
     assert within.mean() >= least_share
     reachable = target[within]
@@ -143,7 +143,7 @@ def test_inverse_reaches_the_workspace(arm, workspace, least_share):
 
 def test_two_iterations_are_enough_for_one_action(arm):
     rng, reach = np.random.default_rng(2), reach_of(PANDA, arm)
-    target = sample_in_volume(rng, 2000, WorkspaceConfig(), 0.05, lowest_m=PANDA.lowest_m)
+    target = sample_in_volume(rng, 2000, WorkspaceConfig(), lowest_m=PANDA.lowest_m)
     displaced = reach.clip(target + rng.uniform(-DISPLACEMENT_M, DISPLACEMENT_M, target.shape))
     solved = arm.forward(arm.solve(solve_from_home(arm, target), displaced))
     error = np.linalg.norm(solved.position - displaced, axis=1)

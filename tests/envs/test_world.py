@@ -29,7 +29,7 @@ def act(worlds, *action, num_steps=1):
 def spread_out(worlds, rng, lowest_m=PANDA.lowest_m):
     """Put every arm over a random point of the workspace, at rest, and every object out of its way."""
     states = worlds.states.copy()
-    target = sample_in_volume(rng, worlds.num_worlds, worlds.config.workspace, 0.05, lowest_m=lowest_m)
+    target = sample_in_volume(rng, worlds.num_worlds, worlds.config.workspace, lowest_m=lowest_m)
     arm = worlds.robot.arm
     states[:, 1:8] = arm.solve(np.tile(arm.home, (worlds.num_worlds, 1)), target, num_iterations=60)
     states[:, 10] = -0.75

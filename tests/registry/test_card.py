@@ -56,7 +56,7 @@ def test_skills_and_orchestrators_have_cards_of_their_own(registry: Registry, pu
         "evaluation/success_last_high": 0.93,
     }
     publish("pushes", spaces=spaces)
-    pushes = publish("pushes", spaces=spaces, config={"trial": {"seed": 5}}, metrics=numbers, parent="pushes@1")
+    pushes = publish("pushes", spaces=spaces, config={"seed": 5}, metrics=numbers, parent="pushes@1")
     head, body = parts(model_card(registry.manifest(str(skills))))
     assert "skills" in head["tags"]
     assert "model-index" not in head
