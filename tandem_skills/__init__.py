@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from service.methods.intrinsic_reward import IntrinsicReward as IntrinsicReward
     from service.methods.method import Iteration as Iteration
     from service.methods.method import Method as Method
-    from service.methods.method import State as State
     from service.registry.loading import Trained as Trained
 
 _PLACES = {
@@ -62,7 +61,6 @@ _PLACES = {
     "Config": "service.config",
     "Method": "service.methods.method",
     "Iteration": "service.methods.method",
-    "State": "service.methods.method",
     "Trained": "service.registry.loading",
     "Evaluation": "service.actors.evaluation",
     "GoalSource": "service.generator.sources",

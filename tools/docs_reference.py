@@ -32,10 +32,8 @@ from service.config.self_play import SelfPlayConfig
 SECTIONS = ("Args", "Returns", "Raises", "Yields", "Attributes")
 SIGNS = {annotated_types.Ge: ">=", annotated_types.Gt: ">", annotated_types.Le: "<=", annotated_types.Lt: "<"}
 RETURNED = (
-    ("service.registry.loading", "Trained"),
     ("service.policies.numpy_policy", "NumpyMCPPolicy"),
     ("service.policies.frozen_skills", "FrozenSkills"),
-    ("service.actors.evaluation", "Evaluation"),
     ("service.runs.train", "Finished"),
 )
 """What the public functions return."""
