@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from service.base.errors import ConfigError
 from service.base.user_code import parse_reference
 from service.config.run import SUCCESS_DISTANCE_M, Config, RunConfig
 from service.config.skills import SKILLS_OF, SACConfig
@@ -79,6 +80,10 @@ class TaskConfig(Config):
             update["world"] = saved.world
         if _may_be(self.primitives, saved.primitives):
             update["primitives"] = saved.primitives
+        elif saved.primitives_digest is None:  # and so nothing would tell whether others fit
+            raise ConfigError(f"primitives = {self.primitives!r}, but the run has {saved.primitives!r}: leave it out")
+        elif Path(self.primitives).exists():
+            update["primitives"] = str(Path(self.primitives).absolute())
         return self.model_copy(update=update)
 
     @model_validator(mode="before")

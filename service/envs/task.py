@@ -206,7 +206,12 @@ class _NotGiven(NDArrayOperatorsMixin):
     def _refuse(self, *_: Any, **__: Any) -> Any:
         raise LookupError(f"{self._part} is not known here")
 
-    __getitem__ = __array__ = __array_ufunc__ = __len__ = __bool__ = __getattr__ = _refuse
+    __getitem__ = __array__ = __array_ufunc__ = __len__ = __bool__ = _refuse
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # asked for by Python, as by copy
+            raise AttributeError(name)
+        return self._refuse()
 
 
 def view_of_places(achieved: Array, desired: Array) -> View:

@@ -6,6 +6,7 @@ Acting is NumPy: nothing here needs torch.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import logging
 import operator
@@ -325,7 +326,7 @@ def _task_of(spaces: Mapping[str, Any], manifest: Manifest, label: str, *, run_c
     if run_code:
         if not isinstance(code, dict) or not isinstance(code.get(reference.origin), str):
             raise TandemError(f"{label}: its manifest lacks the text of {reference.origin}; publish it again")
-        return find_task(name, code, cast("Any", manifest.config.get("task_world")))
+        return find_task(name, code)
     why = (
         f"{label}: what counts is said by code of its publisher, {name}; read it in the manifest, then give "
         "--run-task-code"
@@ -395,6 +396,11 @@ def _skills(config: SkillDiscoveryConfig, parameters: Parameters) -> ZeroShotPol
     return ZeroShotPolicy(FrozenSkills(parameters, config.skills))
 
 
+@functools.cache
+def _warn_once(text: str, *about: str) -> None:
+    _logger.warning(text, *about)
+
+
 def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tuple[Path | str, str | None]) -> Trained:
     """What a run has learned: in a checkpoint or snapshot of it, or in the newest checkpoint."""
     if file is not None and not directory.exists:
@@ -407,7 +413,7 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
     if config.makes is None or config.part not in parts:
         raise TandemError(f"{label} is a run of the method {config.method}, which makes nothing that can be loaded")
     for origin in changed_since(config.code):
-        _logger.warning("%s has another text by now; %s keeps the one that it began with", origin, label)
+        _warn_once("%s has another text by now; %s keeps the one that it began with", origin, label)
     parameters = parts[config.part]
     if isinstance(config, SkillDiscoveryConfig):
         return Trained(label, "skills", config, _skills(config, parameters), parameters, path=path)

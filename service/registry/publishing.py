@@ -123,7 +123,7 @@ def check_publishable(config: Config, registry: Path | str) -> None:
     if is_service(registry):
         raise TandemError(f"{registry} is read only: publish in a directory (--registry DIR), and serve that")
     target = Registry(Path(registry))
-    target.check_writable()
+    target.check_writable(config.name)
     for place in (target, Registry(BUNDLED)):  # of either, NAME@latest would come to mean something else
         for version in place.versions(config.name)[-1:]:
             with contextlib.suppress(StorageError):  # a damaged version is mended by publishing again
@@ -156,7 +156,7 @@ def _described(config: Config) -> dict[str, Any]:
             "primitives": config.primitives,
             "primitives_digest": config.primitives_digest,
         }
-        if (task := find_task(config.task, config.code, config.task_world)).code:
+        if (task := find_task(config.task, config.code)).code:
             spaces["own_task"] = task.data()
         return {
             "spaces": spaces,

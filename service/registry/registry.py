@@ -52,8 +52,8 @@ class Registry:
     def __init__(self, root: Path) -> None:
         self.root = root
 
-    def check_writable(self) -> None:
-        """Check that this registry may be written.
+    def check_writable(self, name: str | None = None) -> None:
+        """Check that this registry may be written, and versions of a name.
 
         Raises:
             RegistryError: it is marked as only read, as the one that comes with tandem is; or it cannot be written.
@@ -61,6 +61,7 @@ class Registry:
         root = self.root.absolute()
         there = next(path for path in (root, *root.parents) if os.path.exists(path))
         of_others = [root / "models", self.blob_path("0" * 64).parent]  # where several users publish
+        of_others += [] if name is None else [self._directory(name) / part for part in ("versions", "aliases")]
         for path in (there, *filter(os.path.exists, of_others)):
             if not path.is_dir() or not os.access(path, os.W_OK | os.X_OK):
                 what = "is not writable" if path.is_dir() else "is no directory"

@@ -32,6 +32,8 @@ OnIteration = Callable[[Metrics], Ending | None]
 OnBeat = Callable[[], None]
 NUM_SNAPSHOTS = 10
 """Snapshots of what was learned, evenly over a run's env steps; one of it untrained comes before them."""
+MAX_IDLE = 1000
+"""Iterations in a row without env steps: a run of them would never end."""
 BEAT_S = 1.0
 """Time between two heartbeats of a run whose iterations take longer."""
 _logger = logging.getLogger(__name__)
@@ -77,7 +79,7 @@ class Run:
         """Seconds spent on iterations, by all processes that ran this run."""
         self._iteration_s = 0.0
         self._last_beat = time.monotonic()
-        self._stop_requested = False
+        self._stop_requested, self._num_idle = False, 0
         self._ending: Ending | None = None
         self._on_iteration: OnIteration = lambda metrics: None
         self._on_beat: OnBeat = lambda: None
@@ -92,11 +94,13 @@ class Run:
             if saved is not None:
                 resumption, state = saved
                 method.iteration, method.num_env_steps = resumption.iteration, resumption.num_env_steps
-                method.start(state)
+                with self.naming_errors():
+                    method.start(state)
                 _logger.info("resumed at iteration %d, %d env steps", self.iteration, self.num_env_steps)
                 directory.start(config, resumption)
             else:
-                method.start()
+                with self.naming_errors():
+                    method.start()
                 # An untrained run is saved, so that one that is killed before its first interval can be resumed, too.
                 self._save()
                 self._take_snapshot(before=-1)
@@ -195,7 +199,7 @@ class Run:
         """Say of an unexpected error of a user's method where in its file it comes from."""
         try:
             yield
-        except TandemError:
+        except (TandemError, OSError, MemoryError):  # of these the file is not the cause
             raise
         except Exception:
             if self._origin is None:
@@ -207,8 +211,11 @@ class Run:
         """Check an iteration of a user's method, which began at so many env steps."""
         if not isinstance(ended, Iteration):
             raise CodeError(f"{self._origin}: step gave a {type(ended).__name__}; give an Iteration or None")
-        if self.num_env_steps <= before:
-            raise CodeError(f"{self._origin}: an iteration made no env steps; say how many with self.count(NUMBER)")
+        self._num_idle = self._num_idle + 1 if self.num_env_steps <= before else 0
+        if self._num_idle >= MAX_IDLE:
+            raise CodeError(
+                f"{self._origin}: {MAX_IDLE} iterations made no env steps; say how many with self.count(NUMBER)"
+            )
 
     def _record(self, ended: Iteration, metrics: Metrics) -> None:
         for name, diverged in ended.diverged.items():

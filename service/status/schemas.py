@@ -24,7 +24,7 @@ class ServiceState(FrozenModel):
 
 
 class RunList(FrozenModel):
-    """Runs, newest start first."""
+    """Runs, active ones first, then newest start first."""
 
     runs: tuple[RunStatus, ...]
     num_runs: int = Field(ge=0, description="that match the request, those over the limit included")

@@ -33,7 +33,7 @@ Content = Literal["status", "metrics", "goals", "stop", "heartbeat", "epoch"]
 MAX_RECORDS = 20_000
 """Of one run, about 60 MB; ``metrics.jsonl`` has them all."""
 HEARTBEAT_S = 10.0
-KEPT: Sequence[Content] = ("status", "metrics", "goals", "epoch")
+EXPIRING: Sequence[Content] = ("status", "metrics", "goals", "epoch")
 KEPT_S = 30 * 86_400
 """Else a Redis with bounded memory is full once some runs have ended; their directories have all of it."""
 _FORM = "redis://[[USER]:PASSWORD@]HOST[:PORT][/DB], with %-escapes for other characters than letters and digits"

@@ -158,6 +158,8 @@ class RedisWriter:
                 f"another run with the id {self._run_id} reports to Redis at {self._address}; stop that one (if it has "
                 f"ended, wait {keys.HEARTBEAT_S:.0f} s), or name another --run-dir"
             )
+        if theirs.partition(b":")[0] == self._run and self._is_newer(theirs):
+            raise RunTakenError(self._run_id)
         self._client.set(self._key("epoch"), self._mine)
         self._client.delete(self._key("stop"))
         self._is_known = True
@@ -189,7 +191,7 @@ class RedisWriter:
                 pipe.zremrangebyscore(key, iteration, "+inf")
                 pipe.zadd(key, {text: iteration})
             pipe.zremrangebyrank(key, 0, -keys.MAX_RECORDS - 1)
-            for content in keys.KEPT:
+            for content in keys.EXPIRING:
                 pipe.expire(self._key(content), keys.KEPT_S)
             pipe.exists(self._key("stop"))
             self._stop = bool(pipe.execute()[-1])

@@ -259,18 +259,18 @@ class RunDirectory:
 
     def _cut_records(self, iteration: int) -> tuple[str, ...]:
         """Keep the records up to an iteration, and say what is lost of them that was not lost before."""
+        known = {text for event in self.history.events for text in event.damaged_records}
         lost = []
         for writer in (self._metrics, self._goals):
             num_kept, num_strange = writer.cut_after(iteration)
             if num_strange:
                 lost.append(f"{writer.path.name}: lines that were no records: {num_strange}")
-            if writer is self._metrics and num_kept < iteration:
-                lost.append(f"{writer.path.name}: iterations that it lacks: {iteration - num_kept}")
-        known = {text for event in self.history.events for text in event.damaged_records}
-        new = tuple(text for text in lost if text not in known)
-        for text in new:
+            if writer is self._metrics and num_kept < iteration:  # of goals not every iteration has some
+                text = f"{writer.path.name}: iterations that it lacks: {iteration - num_kept}"
+                lost += [text] * (text not in known)
+        for text in lost:
             _logger.warning("%s: %s; the run goes on without them", self.path, text)
-        return new
+        return tuple(lost)
 
     def _check_free(self) -> None:
         if self.path.exists() and not self.path.is_dir():

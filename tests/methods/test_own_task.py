@@ -126,12 +126,22 @@ def test_primitives_that_moved_are_named_at_a_resume(file, tmp_path):
     train(config, RunDirectory(tmp_path / "run"), registry, publish=False, on_iteration=lambda _: None)
     exported.rename(tmp_path / "moved")
     directory = RunDirectory(tmp_path / "run")
-    overrides = [f"primitives={tmp_path / 'moved'}", "run.total_env_steps=256"]
+    overrides = ["primitives=./moved", "run.total_env_steps=256"]
     done = train(
         resumed_config(directory, overrides), directory, registry, resume=True, publish=False,
         on_iteration=lambda _: None,
     )  # fmt: skip
     assert done.num_env_steps == 256
+    assert directory.read_config().primitives == str(tmp_path / "moved")
+
+
+def test_a_method_that_takes_no_primitives_keeps_those_it_names(file, tmp_path):
+    registry = tmp_path / "registry"
+    config = begun(registry, "method=scratch-mcp-her")
+    train(config, RunDirectory(tmp_path / "run"), registry, publish=False, on_iteration=lambda _: None)
+    with pytest.raises(TandemError) as error:
+        resumed_config(RunDirectory(tmp_path / "run"), ["primitives=panda-cube-robust@champion"])
+    assert_one_line(error.value, "primitives = 'panda-cube-robust@champion', but the run has 'panda-cube@", "leave it")
 
 
 def test_hindsight_pays_as_the_task_does(file, tmp_path):

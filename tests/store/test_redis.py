@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from service.base.errors import DamagedStoreError, StoreUnavailableError
+from service.base.errors import DamagedStoreError, RunTakenError, StoreUnavailableError
 from service.store import address, redis_writer
 from service.store.address import RUNS, run_key
 from service.store.redis_reader import RedisReader
@@ -95,6 +95,14 @@ def test_a_resumed_run_whose_id_another_one_has_falls_silent_at_the_first_contac
     writer.close()
     assert redis.address.client(1.0).get(run_key("cube", "epoch")) == b"b:1"
     other.close()
+
+
+def test_an_older_process_does_not_take_the_place_of_a_newer_one(redis):
+    newer = a_writer(redis.address, epoch=2)
+    with pytest.raises(RunTakenError):
+        a_writer(redis.address, epoch=1, resumed=True)
+    assert redis.address.client(1.0).get(run_key("cube", "epoch")) == b"a:2"
+    newer.close()
 
 
 def test_what_a_run_has_told_goes_some_time_after_its_last_report(redis, writer, reader):
