@@ -151,7 +151,7 @@ def why_alice_words(studies: Mapping[str, Mapping[str, Any]]) -> str:
     return (
         f"[Why Alice](docs/results/pretraining.md#why-alice)? Of random goals Bob solves {mean['recipe']}; "
         f"{mean['no-cloning']} if he clones none of her turns, "
-        f"{mean['no-difficulty']} if she gets no reward when he fails."
+        f"{mean['no-difficulty']} if his misses earn her nothing."
         f"\nIf he also practises goals of the whole workspace: {mean['uniform']} beside her, "
         f"{mean['uniform-new-alice']} if she never learns, {mean['uniform-alone']} without her."
     )

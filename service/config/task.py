@@ -80,10 +80,13 @@ class TaskConfig(Config):
             update["world"] = saved.world
         if _may_be(self.primitives, saved.primitives):
             update["primitives"] = saved.primitives
-        elif saved.primitives_digest is None:  # and so nothing would tell whether others fit
-            raise ConfigError(f"primitives = {self.primitives!r}, but the run has {saved.primitives!r}: leave it out")
-        elif Path(self.primitives).exists():
+        elif saved.primitives_digest is not None and Path(self.primitives).exists():
             update["primitives"] = str(Path(self.primitives).absolute())
+        else:
+            raise ConfigError(
+                f"primitives = {self.primitives!r}, but the run has {saved.primitives!r}; a resumed run keeps its "
+                "configuration: leave it out, or name the path to which they moved"
+            )
         return self.model_copy(update=update)
 
     @model_validator(mode="before")

@@ -105,7 +105,7 @@ def test_what_alice_is_for_by_hand():
     assert len(lines) == 4
     assert why_alice_words(some) == ""
     words = why_alice_words(dict.fromkeys(ARMS, study(0.1, 0.2)) | some)
-    assert "solves 96 %; 50 % if he clones none of her turns, 15 % if she is unpaid" in words
+    assert "solves 96 %; 50 % if he clones none of her turns, 15 % if his misses earn her nothing" in words
     assert "15 % beside her, 15 % if she never learns, 15 % without her" in words
 
 

@@ -31,7 +31,10 @@ def test_a_skill_run_is_recorded(tmp_path):
     assert {name.partition("/")[0] for name in run["series"]} == {
         "iteration", "env_steps", "time", "evaluation", "skills", "learner"
     }  # fmt: skip
-    kept = {"learner/entropy", "learner/entropy_coefficient"}
+    kept = {
+        f"learner/{name}"
+        for name in ("entropy", "entropy_coefficient", "critic_loss", "actor_loss", "representation_loss")
+    }
     assert {name for name in run["series"] if name.startswith("learner/")} == kept
     found = run["coverage"]["stages"]
     assert {name: stage.get("env_steps") for name, stage in found.items()} == {

@@ -97,7 +97,7 @@ def test_what_was_learned_is_published_measured_and_filmed(learned, monkeypatch)
         ("unknown task 'lift'", ("evaluate", run, "--task", "lift")),
         ("has learned, and its run has the result.json", ("evaluate", run, "--out", "o.json")),
         ("bad name 'No Name'", ("publish", run, "--name", "No Name")),
-        ("is read only: publish in a directory", ("publish", run, "--registry", "http://127.0.0.1:9")),
+        ("is a service; give the directory of a registry", ("publish", run, "--registry", "http://127.0.0.1:9")),
         ("no run in panda-cube@champion", ("publish", "panda-cube@champion")),
     ):
         assert_refused(tandem(*arguments), words)

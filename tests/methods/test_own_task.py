@@ -141,7 +141,9 @@ def test_a_method_that_takes_no_primitives_keeps_those_it_names(file, tmp_path):
     train(config, RunDirectory(tmp_path / "run"), registry, publish=False, on_iteration=lambda _: None)
     with pytest.raises(TandemError) as error:
         resumed_config(RunDirectory(tmp_path / "run"), ["primitives=panda-cube-robust@champion"])
-    assert_one_line(error.value, "primitives = 'panda-cube-robust@champion', but the run has 'panda-cube@", "leave it")
+    assert_one_line(
+        error.value, "primitives = 'panda-cube-robust@champion', but the run has 'panda-cube@", "leave it out"
+    )
 
 
 def test_hindsight_pays_as_the_task_does(file, tmp_path):

@@ -111,14 +111,14 @@ def test_a_run_that_is_killed_and_goes_on_elsewhere(uninterrupted, tmp_path, mom
 
 def while_records_are_cut(patch):
     """One file is cut and the other is not."""
-    cut = JsonlWriter.cut
+    cut_after = JsonlWriter.cut_after
 
-    def cut_one(self, num_bytes):
+    def cut_one(self, iteration):
         if self.path.name == "goals.jsonl":
             die()
-        cut(self, num_bytes)
+        return cut_after(self, iteration)
 
-    patch.setattr(JsonlWriter, "cut", cut_one)
+    patch.setattr(JsonlWriter, "cut_after", cut_one)
 
 
 def test_a_resume_that_is_killed_while_it_cuts_the_records(uninterrupted, tmp_path):
