@@ -60,14 +60,16 @@ class Experiment:
 
 def experiments(out: Path = RESULTS) -> Iterator[Experiment]:
     """Everything, the most important first; ``out`` has recorded files, and the registry in its ``primitives``."""
-    tasks, nothing = PAPERS, tuple(f"scratch-{net}{her}" for her in ("-her", "") for net in ("monolithic", "mcp"))
+    tasks, networks = PAPERS, ("monolithic", "mcp")
     for seed in PRIMITIVES:
         yield from (_trial(out, task, method, seed) for method in ("ours-her", "ours") for task in tasks)
         yield _trial(out, "push", "ours-residual-her", seed)
         yield from (_trial(out, task, method, seed) for method in ("asp-only", "idle") for task in tasks)
-    yield from (_trial(out, task, method, seed) for seed in PRIMITIVES for method in nothing for task in tasks)
+    for her in ("-her", ""):
+        trials = ((seed, f"scratch-{net}{her}", task) for seed in PRIMITIVES for net in networks for task in tasks)
+        yield from (_trial(out, task, method, seed) for seed, method, task in trials)
     for task in ("inair", "sphere", "push"):
-        yield from (_longer(out, task, f"scratch-{net}-her") for net in ("monolithic", "mcp"))
+        yield from (_longer(out, task, f"scratch-{net}-her") for net in networks)
         yield _longer(out, task, "scratch-monolithic-her", MANY_UPDATES)
     yield from (each for seed in PRIMITIVES for each in _skills(out, seed))
     for seed, reference in PAPER_PRIMITIVES.items():
