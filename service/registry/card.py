@@ -53,7 +53,7 @@ PAPERS = {
 _RATE = re.compile(r"evaluation/(?:(\w+)_)?success_(last|ever)")
 _HISTORY = "Settings that changed on the way, and records that were lost:"
 _SUCCESS = "Share of episodes in which the object was at its goal, in simulation and without noise in the actions:"
-_OWN = "Share of episodes that succeeded by the task's own code, in simulation and without noise in the actions:"
+_OWN = "Share of episodes that succeeded as the task says, in simulation and without noise in the actions:"
 _WHEN = {"last": "success at the last step", "ever": "success at any step"}
 
 
@@ -145,8 +145,7 @@ def _kind(manifest: Manifest) -> tuple[str, str, str, list[str]]:
             "policy.begin()  # before new episodes: it remembers the step before\n"
             "action = policy.act_deterministic(observation)  # (N, O) positions and goal -> (N, 4)",
             f"The registry, or the one that comes with the package, has to have `{frozen}`, too."
-            + " To evaluate it, read the code of its task above, and add `run_task_code=True`."
-            * ("own_task" in spaces),
+            + " To evaluate it, read its task's code above, and add `run_task_code=True`." * ("own_task" in spaces),
             ["tandem", *how, "sac", *["her"] * method.endswith("-her")],
         )
     if spaces.get("kind") == "skills":

@@ -76,6 +76,10 @@ def test_skills_and_orchestrators_have_cards_of_their_own(registry: Registry, pu
     ):
         assert said in body, said
     assert body.endswith("## Licence\n\nmit\n")
+    own = publish("own", spaces=spaces | {"task": "mine.py", "own_task": {"title": "Mine"}}, metrics=numbers)
+    bodies = body, parts(model_card(registry.manifest(str(own))))[1]
+    for said in ("succeeded as the task says", "read its task's code above, and add `run_task_code=True`"):
+        assert [said in each for each in bodies] == [False, True], said
 
 
 def test_a_card_says_how_primitives_were_learned():
