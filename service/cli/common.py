@@ -151,6 +151,23 @@ def was_typed(context: typer.Context, name: str) -> bool:
     return source is not None and source.name == "COMMANDLINE"  # typer has a ParameterSource of its own
 
 
+def typed_options(context: typer.Context, names: Sequence[str]) -> list[str]:
+    """Those options of ``names`` that were typed, as one would type them."""
+    words: list[str] = []
+    for name in names:
+        if was_typed(context, name):
+            option, value = name.replace("_", "-"), context.params[name]
+            if isinstance(value, bool):
+                words.append(f"--{option}" if value else f"--no-{option}")
+            else:
+                words += [
+                    word
+                    for each in (value if isinstance(value, list | tuple) else [value])
+                    for word in (f"--{option}", str(each))
+                ]
+    return words
+
+
 def loading() -> AbstractContextManager[Task]:
     """Show that packages and parameters are being loaded, which takes seconds on a busy machine."""
     return doing("loading", aloud=False)
@@ -260,18 +277,9 @@ def _write_traceback(error: Exception, directory: Path) -> str:
     return path
 
 
-def how_to_go_on(
-    run_dir: Path,
-    registry: Path | str,
-    *,
-    publish: bool | None = None,
-    runtime: str = "local",
-    address: str | None = None,
-) -> str:
-    """The command that continues a run or a study, where it was begun; ``publish`` is None for its default."""
-    command = ["tandem", "train", "--resume", "--run-dir", str(run_dir), "--registry", str(registry)]
-    command += [] if publish is None else ["--publish" if publish else "--no-publish"]
-    command += ["--runtime", runtime] * (runtime != "local") + (["--address", address] if address is not None else [])
+def how_to_go_on(run_dir: Path, registry: Path | str, typed: Sequence[str] = ()) -> str:
+    """The command that continues a run or a study, with the options that were ``typed`` and no file keeps."""
+    command = ["tandem", "train", "--resume", "--run-dir", str(run_dir), "--registry", str(registry), *typed]
     return f"continue with: {shlex.join(command)}"
 
 

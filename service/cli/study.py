@@ -59,6 +59,7 @@ def train_study(
     address: str | None,
     trackers: Sequence[str],
     start_from: str | None,
+    typed: Sequence[str],
 ) -> None:
     """Run a study and say what came out; exit code 1 where a run failed.
 
@@ -79,6 +80,7 @@ def train_study(
         address: of the cluster.
         trackers: of every run; see ``service.runs.trackers``.
         start_from: as typed; what the runs of a new study begin from.
+        typed: options of the command that goes on.
     """
     from service.registry.loading import load
     from service.runs.study import Study
@@ -107,9 +109,7 @@ def train_study(
     registry = _registry(source, configs.values(), publish)
     where = source if is_service(source) else str(Path(source).absolute())
     options = ["--registry", where, *(part for tracker in trackers for part in ("--tracker", tracker))]
-    runtime = "ray" if cluster is not None else "local"
-    typed = False if publish is False else None  # a study publishes its best run by default
-    hint = how_to_go_on(study.path, source, publish=typed, runtime=runtime, address=address)
+    hint = how_to_go_on(study.path, source, typed)
     told = cluster() if cluster is not None else None  # reads the status service's token
     try:
         with closing(study), traceback_in(study.path), ExitStack() as stack:

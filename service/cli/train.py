@@ -24,6 +24,7 @@ from service.cli.common import (
     shown,
     stopped,
     traceback_in,
+    typed_options,
     was_typed,
 )
 from service.cli.configs import named, targets
@@ -48,6 +49,8 @@ AUTO, EXACTLY = "auto", "exactly"
 """Values of ``--resume``; the second where it is typed alone."""
 _OF_RAY, _OF_A_RUN_ON_RAY = ("address", "status", "token_file"), ("num_actors", "actor_threads", "learner_cpus")
 """Options that mean nothing in one process."""
+_NOT_SAVED = ("publish", "parallel", "runtime", *_OF_RAY, *_OF_A_RUN_ON_RAY, "tracker")
+"""Options that a resumed run has no file to read from."""
 
 
 class TrainCommand(TyperCommand):
@@ -188,12 +191,13 @@ def train(
                 raise TandemError(f"--{name.replace('_', '-')} {why}")
     if again and run_dir is None:
         raise TandemError("--resume needs --run-dir, the directory of what is to be continued")
+    typed = typed_options(context, _NOT_SAVED)
     if study:
         train_study(
             run_dir, what, method, primitives, seeds, grid,
             overrides=overrides, runs=runs, source=source, resume=None if resume == AUTO else again,
             publish=publish, parallel=parallel, cluster=cluster_options if runtime == "ray" else None, address=address,
-            trackers=trackers, start_from=start_from,
+            trackers=trackers, start_from=start_from, typed=typed,
         )  # fmt: skip
         return
     file, first = named(what, method, primitives)
@@ -214,7 +218,7 @@ def train(
             resolved = load_config(begun, overrides).begin(source, start)
     train_and_tell(
         resolved, directory, source, resume=again, publish=publish, start=start, trackers=trackers,
-        cluster=cluster_options() if runtime == "ray" else None, address=address,
+        cluster=cluster_options() if runtime == "ray" else None, address=address, typed=typed,
     )  # fmt: skip
 
 
@@ -229,22 +233,20 @@ def train_and_tell(
     trackers: Sequence[str] = (),
     cluster: ClusterOptions | None = None,
     address: str | None = None,
+    typed: Sequence[str] = (),
     until: OnIteration = lambda metrics: None,
 ) -> Finished:
     """Train, show how far that is, and say what came out, or how to go on.
 
-    ``publish`` is None for all but policies of tasks.
+    ``publish`` is None for all but policies of tasks; ``typed`` options belong to the command that goes on.
     """
     with loading():
         from service.runs import train as training
         from service.store.disk_reader import run_id_of
 
     runtime = training.Runtime()
-    where = "local" if cluster is None else "ray"
-    by_default = config.makes != "orchestrator"
-    publish = by_default if publish is None else publish
-    typed = None if publish == by_default else publish
-    hint = how_to_go_on(directory.path, registry, publish=typed, runtime=where, address=address)
+    publish = config.makes != "orchestrator" if publish is None else publish
+    hint = how_to_go_on(directory.path, registry, typed)
     try:
         with traceback_in(directory.path), closing(directory), ExitStack() as stack:
             if cluster is not None:

@@ -245,14 +245,21 @@ def stopped_at_once(monkeypatch):
     ("options", "hint"),
     [
         ((), ""),
-        (("--publish",), ""),
+        (("--publish",), " --publish"),
         (("--no-publish",), " --no-publish"),
-        (("--runtime", "ray", "--address", "head:6379", "--status", "off"), " --runtime ray --address head:6379"),
+        (
+            ("--status", "off", "--address", "head:6379", "--runtime", "ray"),
+            " --runtime ray --address head:6379 --status off",
+        ),
+        (("--tracker", "logging:LoggerAdapter"), " --tracker logging:LoggerAdapter"),
+        (("--set", "seed=3", "--quiet"), ""),  # the run's files have the one, the other changes nothing in it
     ],
 )
 @pytest.mark.parametrize("seeds", [(), ("--seeds", "0,1")])
 @pytest.mark.usefixtures("stopped_at_once")
-def test_how_to_go_on_is_as_the_run_was_begun(tmp_path, monkeypatch, options, hint, seeds):
+def test_how_to_go_on_has_the_options_that_no_file_of_the_run_has(tmp_path, monkeypatch, options, hint, seeds):
+    if seeds:
+        options = [each if each != "seed=3" else "run.num_threads=1" for each in options]
     monkeypatch.setattr("service.cluster.ray_connection.connected", lambda address: nullcontext())
     monkeypatch.setattr("service.cli.study._on_ray", lambda *_: Place())
     result = tandem("pretrain", "--run-dir", tmp_path / "a run", "--registry", "registry", *seeds, *options)
@@ -264,9 +271,9 @@ def test_how_to_go_on_is_as_the_run_was_begun(tmp_path, monkeypatch, options, hi
 @pytest.mark.usefixtures("stopped_at_once")
 def test_how_to_go_on_publishes_a_policy_of_a_task_only_if_that_was_typed(tmp_path):
     asked = ("train", "push", "--registry", "registry", "--run-dir", tmp_path / "run")
-    for typed, said in (("--publish", " --publish"), ("--no-publish", "")):
-        result = tandem(*asked, typed)
-        assert result.stdout.endswith(f" --registry registry{said}\n"), result.output
+    for typed in (["--publish"], ["--no-publish"], []):
+        result = tandem(*asked, *typed)
+        assert result.stdout.endswith(" ".join([" --registry registry", *typed]) + "\n"), result.output
 
 
 # --- what can be done with it ----------------------------------------------------------------------------------------

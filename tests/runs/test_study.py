@@ -379,7 +379,8 @@ def test_a_study_is_killed_stopped_resumed_and_names_its_best(tmp_path, monkeypa
     troublemaker.join()
 
     assert result.exit_code == 130, result.output
-    assert f"saved; continue with: tandem train --resume --run-dir {path} --registry {registry}\n" in result.stdout
+    how = f"tandem train --resume --run-dir {path} --registry {registry} --parallel 2"
+    assert f"saved; continue with: {how}\n" in result.stdout
     assert_one_line(result.stderr.splitlines()[-1], "seed-8 failed: ended by SIGKILL", path / "seed-8" / "log.txt")
     assert re.search(r"^seed-[38]: [0-9,]+ of [0-9,]+ env steps, .* \| ", result.stderr, re.MULTILINE)
     assert told() == {"seed-3": "interrupted", "seed-8": "failed"}
