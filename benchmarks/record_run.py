@@ -30,7 +30,7 @@ from service.actors.evaluation import DeterministicPolicy, IdlePolicy, evaluate
 from service.base.errors import TandemError
 from service.base.tensors import split_parts
 from service.base.types import StateArray
-from service.config import Config
+from service.config import Config, WorldConfig
 from service.config.skills import SkillDiscoveryConfig
 from service.envs.task import EPISODE_STEPS, Task
 from service.envs.tasks import find_task
@@ -55,7 +55,7 @@ OURS = "ours"
 SKILL_POINTS = 100
 KEPT_OF_SKILLS = (*COUNTERS, "evaluation/coverage", "skills/", "learner/", "bob/env_steps_fraction")
 """Beginnings of the names of metrics that are kept of skills."""
-NUM_EPISODES, NUM_STEPS = 300, 50
+NUM_EPISODES = 300
 ASKED, ASKED_STEPS = 0.90, 30e6
 """Success on mixed goals at the last step, after at most so many env steps from scratch."""
 SEED = 0
@@ -185,23 +185,28 @@ def measure_tasks(
     Returns:
         Rows as ``tandem evaluate --json`` prints them; ``policy`` is "bob" or "idle", ``goals`` the task's name.
     """
-    rows, tasks = [], TASKS
-    if config.world.num_objects > 1:
-        tasks = {name: task for name, task in TASKS.items() if name != "sphere"} | {"one": Task("One", goals="one")}
-    for name, task in tasks.items():
+    rows = []
+    for name, task in tasks_in(config.world).items():
         for label, policy in {"bob": bob, "idle": IdlePolicy()}.items():
             result = evaluate(
                 policy,
                 task.world_from(config.world),
                 task.goal_kind,
                 num_episodes=num_episodes,
-                num_steps=NUM_STEPS,
+                num_steps=config.run.evaluation_steps,
                 success_distance_m=config.success_distance_m,
                 seed=SEED,
                 num_threads=config.run.num_threads,
             )
             rows.append({"policy": label, **result.as_dict(), "goals": name})
     return rows
+
+
+def tasks_in(world: WorldConfig) -> dict[str, Task]:
+    """Those of ``TASKS`` that a world has, and of several objects one alone."""
+    if world.num_objects == 1:
+        return TASKS
+    return {name: task for name, task in TASKS.items() if name != "sphere"} | {"one": Task("One", goals="one")}
 
 
 def pick_stages(env_steps: Collection[int]) -> dict[str, int]:

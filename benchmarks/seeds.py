@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.measuring import ROOT, machine, one_line_errors, write_json
-from benchmarks.record_run import TASKS
+from benchmarks.record_run import tasks_in
 from benchmarks.trials import learn
 from service.actors.evaluation import evaluate
 from service.base.errors import TandemError
@@ -29,8 +29,9 @@ from service.runs.grid import parse_seeds
 from service.store.checkpoints import read_checkpoint
 from service.store.run_directory import RunDirectory
 
-KINDS = ("mixed", "table", "air", "larger")
-NUM_EPISODES, NUM_STEPS, SEED = 1_000, 50, 1
+KINDS = ("mixed", "table", "air", "larger", "one")
+"""Of goals, where the world has them: the last are for several objects."""
+NUM_EPISODES, SEED = 1_000, 1
 """Of what is measured; the seed of the goals is another than those of evaluations during a run."""
 NUM_EVALUATED = 300
 """Goals of an evaluation during a run."""
@@ -49,16 +50,16 @@ def seed_config(recipe: str, seed: int, env_steps: int, settings: Sequence[str])
 def measure(directory: RunDirectory, config: SelfPlayConfig, at: Sequence[float]) -> list[dict[str, Any]]:
     """Success at the last step, at any step, of the averaged Bob of the checkpoints nearest to some env steps."""
     files = {int(read_checkpoint(file).meta["env_steps"]): file for file in directory.checkpoints.glob("*.safetensors")}
-    rows = []
+    rows, tasks = [], {kind: task for kind, task in tasks_in(config.world).items() if kind in KINDS}
     for asked in at:
         env_steps = min(files, key=lambda found: abs(found - asked))
         arrays = read_checkpoint(files[env_steps]).arrays
         bob = numpy_bob({name.removeprefix(BOB): array for name, array in arrays.items() if name.startswith(BOB)})
         row: dict[str, Any] = {"asked": asked, "env_steps": env_steps}
-        for kind in KINDS:
-            task = TASKS[kind]
+        for kind, task in tasks.items():
             found = evaluate(
-                bob, task.world_from(config.world), task.goal_kind, num_episodes=NUM_EPISODES, num_steps=NUM_STEPS,
+                bob, task.world_from(config.world), task.goal_kind,
+                num_episodes=NUM_EPISODES, num_steps=config.run.evaluation_steps,
                 success_distance_m=config.success_distance_m, seed=SEED, num_threads=config.run.num_threads,
             )  # fmt: skip
             row[kind] = {"last": found.success_last, "ever": found.success_ever}
@@ -69,7 +70,7 @@ def measure(directory: RunDirectory, config: SelfPlayConfig, at: Sequence[float]
 def curve(directory: RunDirectory) -> list[dict[str, float]]:
     """The run's own evaluations."""
     rows = read_records(directory.metrics_file)
-    names = {f"evaluation/{kind}_success_last": kind for kind in ("mixed", "table", "air")}
+    names = {f"evaluation/{kind}_success_last": kind for kind in KINDS}
     kept = {"env_steps": "env_steps", "time/wall_s": "wall_s", "alice/lifted_fraction": "lifted", **names}
     return [{kept[name]: row[name] for name in kept if name in row} for row in rows if next(iter(names)) in row]
 
@@ -109,7 +110,7 @@ def record(
         result["runs"] = sorted([*result["runs"], run], key=lambda each: each["seed"])
         write_json(file, result)
         for row in run["measured"]:
-            rates = ", ".join(f"{kind} {100 * row[kind]['last']:.1f}" for kind in KINDS)
+            rates = ", ".join(f"{kind} {100 * row[kind]['last']:.1f}" for kind in KINDS if kind in row)
             print(f"{file.stem}, seed {seed} at {row['env_steps'] / 1e6:.2f} M: {rates}", flush=True)
 
 

@@ -81,11 +81,13 @@ def _judged(evaluations: Records) -> list[str]:
 def seeds_block(study: Mapping[str, Any]) -> str:
     """What ``benchmarks.seeds`` recorded: a row for each seed, and how many there are of what is asked for."""
     at = sorted({row["asked"] for run in study["runs"] for row in run["measured"]})
-    head = ("seed", *(f"{millions(asked)}: mixed, table, air, *Larger*" for asked in at), "dips", "Alice lifts")
+    kinds = [kind for kind in KINDS if kind in study["runs"][0]["measured"][0]]
+    names = ", ".join("*Larger*" if kind == "larger" else kind for kind in kinds)
+    head = ("seed", *(f"{millions(asked)}: {names}" for asked in at), "dips", "Alice lifts")
     rows = []
     for run in study["runs"]:
         found = {row["asked"]: row for row in run["measured"]}
-        cells = [", ".join(f"{100 * found[a][kind]['last']:.1f}" for kind in KINDS) if a in found else "" for a in at]
+        cells = [", ".join(f"{100 * found[a][kind]['last']:.1f}" for kind in kinds) if a in found else "" for a in at]
         lifts = [point["lifted"] for point in run["curve"][-NUM_LAST:]]
         rows.append((str(run["seed"]), *cells, dips(run["curve"]), percent(fmean(lifts))))
     words = f"At least {percent(ASKED_RATES['mixed'])} of mixed goals: {_how_many(study)} env steps."
