@@ -30,6 +30,7 @@ PRIMITIVES = {0: "panda-cube@seed-30", 1: "panda-cube@seed-31", 2: "panda-cube@s
 """Versions in ``primitives`` by the seed of the trials that take them: each has its own pre-training."""
 PAPER_PRIMITIVES = {seed: f"panda-cube-paper@seed-{10 + seed}" for seed in PRIMITIVES}
 """The same, of the recipe as the paper has it."""
+NETWORKS = ("monolithic", "mcp")
 SKILL_METHODS = ("lsd", "metra", "dads", "diayn")
 SKILL_ENV_STEPS = 4_000_000
 LONGER_ENV_STEPS = 1_000_000
@@ -60,18 +61,17 @@ class Experiment:
 
 def experiments(out: Path = RESULTS) -> Iterator[Experiment]:
     """Everything, the most important first; ``out`` has recorded files, and the registry in its ``primitives``."""
-    tasks, networks = PAPERS, ("monolithic", "mcp")
+    tasks = PAPERS
     for seed in PRIMITIVES:
         yield from (_trial(out, task, method, seed) for method in ("ours-her", "ours") for task in tasks)
         yield _trial(out, "push", "ours-residual-her", seed)
         yield from (_trial(out, task, method, seed) for method in ("asp-only", "idle") for task in tasks)
-    for her in ("-her", ""):
-        trials = ((seed, f"scratch-{net}{her}", task) for seed in PRIMITIVES for net in networks for task in tasks)
-        yield from (_trial(out, task, method, seed) for seed, method, task in trials)
+    yield from _from_scratch(out, "-her")
     for task in ("inair", "sphere", "push"):
-        yield from (_longer(out, task, f"scratch-{net}-her") for net in networks)
+        yield from (_longer(out, task, f"scratch-{net}-her") for net in NETWORKS)
         yield _longer(out, task, "scratch-monolithic-her", MANY_UPDATES)
     yield from (each for seed in PRIMITIVES for each in _skills(out, seed))
+    yield from _from_scratch(out, "")
     for seed, reference in PAPER_PRIMITIVES.items():
         for method in ("ours", "asp-only"):
             for task in tasks:
@@ -80,6 +80,11 @@ def experiments(out: Path = RESULTS) -> Iterator[Experiment]:
     for seed in (0, 1):
         for method in ("ours-her", "ours", "scratch-monolithic-her", "scratch-monolithic"):
             yield _trial(out, "hard-push", method, seed)
+
+
+def _from_scratch(out: Path, her: str) -> Iterator[Experiment]:
+    for seed in PRIMITIVES:
+        yield from (_trial(out, task, f"scratch-{net}{her}", seed) for net in NETWORKS for task in PAPERS)
 
 
 def _trial(out: Path, task: str, method: str, seed: int) -> Experiment:
