@@ -104,13 +104,13 @@ class Report:
         """Write all pages and pictures."""
         found = read_all(self._results, FILES)
         runs = [run for run in read_all(self._results / "runs").values() if "ablation" not in run]
-        trials, recorded_skills = (list(read_all(self._results / name).values()) for name in ("downstream", "skills"))
+        trials = list(read_all(self._results / RESULTS.name / "downstream").values())
+        recorded_skills = list(read_all(self._results / "skills").values())
         for page, names in PAGES.items():  # what is wrong with a page is found before anything is drawn
             words = replace_blocks(self._docs / page, dict.fromkeys(names, ""))
             if page in ABOUT_THE_RECIPE:
                 recipe.check_words(self._docs / page, words, found["time_to_skill"])
         seeds, why = read_all(self._results / "seeds"), read_all(self._results / "why_alice")
-        coming = list(read_all(self._results / RESULTS.name / "downstream").values())
         judged = (
             pretraining.seeds_words(seeds[SEEDS]),
             time_to_skill.words(found["time_to_skill"]),
@@ -121,7 +121,7 @@ class Report:
             "results/pretraining.md": self.pretraining_blocks(runs, found, seeds, why),
             "results/skills.md": self.skills_blocks(recorded_skills),
             "results/comparison.md": self.comparison_blocks(trials),
-            "downstream.md": {"headline": [comparison.headline_table(trials, coming)]},
+            "downstream.md": {"headline": [comparison.headline_table(trials)]},
             "../README.md": {
                 "headline": [comparison.headline_table(trials)],
                 "seeds": ["\n".join(filter(None, judged))],
@@ -187,7 +187,7 @@ class Report:
     def comparison_blocks(self, trials: Sequence[Result]) -> Blocks:
         """Parts of the blocks that compare with the paper."""
         as_paper, longer, more_updates = (
-            list(read_all(self._results / f"downstream_{name}").values())
+            list(read_all(self._results / RESULTS.name / f"downstream_{name}").values())
             for name in ("paper", "longer", f"longer_{MANY_UPDATES}")
         )
         blocks = {

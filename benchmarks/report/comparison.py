@@ -149,10 +149,10 @@ def _cell(seeds: Seeds, paper: float) -> str:
     return f"**{text}**" if ours.low > high or ours.high < low else text
 
 
-def headline_table(results: Sequence[Result], coming: Sequence[Result] = ()) -> str:
+def headline_table(results: Sequence[Result]) -> str:
     """Success at the last step: composing, Bob alone, and the best method of other kinds on each task.
 
-    Every cell has its number of seeds in brackets. ``coming`` are trials of the next table, which is not whole yet.
+    Every cell has its number of seeds in brackets.
     """
     rates = {place: rate_of(seeds) for place, seeds in by_method_and_task(results).items()}
     known = {method for method, _ in rates}
@@ -173,19 +173,7 @@ def headline_table(results: Sequence[Result], coming: Sequence[Result] = ()) -> 
             )
     rows.append(("*the best of the paper*", *(f"*{percent(rate)} ({_PAPER_SEEDS})*" for rate in BEST.values())))
     words = "Success at the last step, mean of the seeds; in brackets their number."
-    return f"{table(('', *(find_task(task).title for task in PAPERS)), rows)}\n\n{words}{_coming(coming)}"
-
-
-def _coming(results: Sequence[Result]) -> str:
-    """What the next table has so far of tasks that were composed, beside what learned from nothing."""
-    rates = {place: rate_of(seeds) for place, seeds in by_method_and_task(results).items()}
-    cells = []
-    for task in PAPERS:
-        if (_OWN, task) in rates:
-            nothing = _best([rates[name, task] for name in learning(None) if (name, task) in rates])
-            beside = f", from nothing {nothing}" if nothing else ""
-            cells.append(f"{find_task(task).title} {_best([rates[_OWN, task]])}{beside}")
-    return f" With today's primitives so far: {'; '.join(cells)}." if cells else ""
+    return f"{table(('', *(find_task(task).title for task in PAPERS)), rows)}\n\n{words}"
 
 
 def _best(rates: Sequence[Rate]) -> str:

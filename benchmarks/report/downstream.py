@@ -64,8 +64,8 @@ def write_page(results: Sequence[Result]) -> str:
     check_versions(results)
     of = by_method_and_task(results)
     parts = [
-        "# Downstream\n\nWritten by `python -m benchmarks.report` from the files in `downstream/`, one for each trial, "
-        "a method on a task with a seed;\n[what the tasks and methods are](../downstream.md).\n",
+        "# Downstream\n\nWritten by `python -m benchmarks.report` from the files in `v2/downstream/`, one for each "
+        "trial, a method on a task with a seed;\n[what the tasks and methods are](../downstream.md).\n",
         "## Success at the last step\n",
         "Mean of the seeds; in brackets their number. The interval is one of 95 % for the mean over seeds (Student's "
         "t). A single seed has Wilson's over its episodes instead, marked by a star: it says how far the share may be "
@@ -83,7 +83,7 @@ def write_page(results: Sequence[Result]) -> str:
         "Without noise, 100 goals a point; dotted: what learns nothing. Where a curve still rises, the tables say what "
         "the method has after so many env steps, not what it would come to.\n",
         "## Env steps and time\n",
-        f"Env steps in thousands, minutes of wall-clock time, {_minutes(results)}. Before the plus sign "
+        "Env steps in thousands, minutes of wall-clock time, with the evaluations on the way. Before the plus sign "
         "what the primitives or skills took, in millions of env steps: all tasks have the same.\n",
         methods_table(of, _cost),
         *_efficiency(of),
@@ -93,15 +93,11 @@ def write_page(results: Sequence[Result]) -> str:
     return "\n".join(parts)
 
 
-def _minutes(results: Sequence[Result]) -> str:
-    """What the minutes of trials are of: those of the first version of what learns were counted otherwise."""
-    first = all(each["made"].get("learning_version", 1) == 1 for each in results)
-    return "of learning alone" if first else "with the evaluations on the way"
-
-
 def _harder(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
     """The section on harder tasks."""
     tasks = [name for name in TASKS[len(PAPERS) :] if any(task == name for _, task in of)]
+    if not tasks:
+        return ()
     return (
         "\n## A harder start and cube\n",
         "The end effector starts 20 cm above the table instead of 8, and the cube has 1 kg instead of 0.1 and half the "
