@@ -40,9 +40,9 @@ def paid(game, goal):
 def test_what_lies_at_its_goal_at_the_start_pays_nothing_until_it_leaves():
     far = (0.1, 0.1, 0.025)
     game = make_game()
-    assert paid(game, [*RED, *far]) == [0.0] * 7
+    assert paid(game, [*RED, *far]) == [0.0] * 14
     slides(game := make_game(), "object", 1.5)  # 11 cm: red leaves its goal
-    assert sorted(paid(game, [*RED, *far])) == [-1.0] + [0.0] * 6
+    assert sorted(paid(game, [*RED, *far])) == [-1.0] + [0.0] * 13
 
 
 def test_each_that_comes_pays_and_all_pay_more():
@@ -68,6 +68,17 @@ def test_the_turn_ends_when_all_are_held():
     there = distances(path, rollout.records.goal[0]) <= 0.05
     first = int(np.argmax(there.all(axis=1)))
     assert rollout.records.num_bob_steps[0] == first + 1  # it is seen a step before it is paid
+
+
+def test_a_turn_has_time_for_each_object_that_has_to_be_moved():
+    far = (0.1, 0.15, 0.025)
+    game = make_game(3, bob_hold_steps=20)
+    rollout = play(game, choose_goals=given(np.array([[*RED, *far], [*far, *BLUE], [*BLUE, *RED]])))
+    assert rollout.records.num_bob_steps.tolist() == [7, 7, 14]
+    assert rollout.bob.active.sum(axis=0).tolist() == [7, 7, 14]
+    assert not rollout.bob.terminated.any()  # running out of time is no end: what comes after counts
+    at_goal = play(make_game(bob_hold_steps=20), choose_goals=given(np.array([*RED, *BLUE])))
+    assert at_goal.records.num_bob_steps.tolist() == [14]
 
 
 def test_alices_goal_keeps_what_she_did_not_move():
