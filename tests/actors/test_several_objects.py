@@ -7,7 +7,6 @@ from service.actors.self_play import SPANNING_SHARE, SelfPlay
 from service.config import parse_config
 from service.envs.observations import distances, each_object
 from service.generator.validity import Verdict
-from service.learner.samples import exchange, exchange_at_random
 from tests.actors.players import Chooser, Noise, alices_own, assert_same_rollout, given, make_config, play
 from tests.runs.runs import TREE, assert_same_run
 from tests.runs.runs import play as run
@@ -163,19 +162,6 @@ def test_hindsight_leaves_out_steps_after_which_nothing_moves():
     assert len(found) == 2 * 8 // 4  # one in four is shown
     seen = game.worlds.observed.bob
     assert (distances(found[:, seen["object"]], found[:, seen["goal"]]).max(axis=1) > 0.05).all()
-
-
-def test_demonstrations_are_exchanged_at_random():
-    rollout = play(make_game(8, places=None, seed=2), Noise(), choose_goals=given(np.array([*RED, *BLUE])))
-    seen = make_game().worlds.observed
-    observation = rollout.bob.observation.reshape(-1, seen.bob.size)
-    given_rows = type(rollout.demonstrations)(observation, rollout.bob.action.reshape(-1, 4))
-    mixed = exchange_at_random(given_rows, exchange(seen, 0, 1), np.random.default_rng(0))
-    chosen = np.random.default_rng(0).random(len(observation)) < 0.5
-    np.testing.assert_array_equal(mixed.observation[~chosen], observation[~chosen])
-    goals = each_object(mixed.observation[chosen][:, seen.bob["goal"]])
-    np.testing.assert_array_equal(goals[:, ::-1], each_object(observation[chosen][:, seen.bob["goal"]]))
-    np.testing.assert_array_equal(mixed.action, given_rows.action)
 
 
 @pytest.fixture(scope="module")
