@@ -273,13 +273,15 @@ class SelfPlay:
     ) -> tuple[Turns, BoolArray, BoolArray]:
         """Bob's turns; (N,) solved; (N,) worlds whose physics diverged.
 
-        A world's turn ends when its objects have been at their goals for ``bob_hold_steps`` steps in a row, or its
-        physics diverged. The others go on; ``playing`` holds their indices.
+        A world's turn ends when its objects have been at their goals for ``bob_hold_steps`` steps in a row, its physics
+        diverged, or its time is over, which is longer where several objects have to be moved. The others go on;
+        ``playing`` holds their indices.
         """
         game, worlds = self.config.game, self.worlds
         num = worlds.num_worlds
         sizes = worlds.observed.bob.size, worlds.observed.bob_value.size
-        turns = _empty_turns(game.bob_steps, num, *sizes, learn=choice.played & ~plan.bob_past)
+        most_steps = game.bob_steps * self.config.world.num_objects
+        turns = _empty_turns(most_steps, num, *sizes, learn=choice.played & ~plan.bob_past)
         diverged = np.zeros(num, dtype=bool)
         num_held: IntArray = np.zeros(num, dtype=np.int64)
         margin_m = game.bob_margin_m if players.version >= game.bob_margin_after_updates else 0.0
@@ -288,9 +290,10 @@ class SelfPlay:
         there: BoolArray = distances(worlds.object_position, choice.goal) <= reach_m
         # What lies at its goal counts as there, unless there is nothing else to do.
         there &= ~np.all(there, axis=1, keepdims=True)
+        num_steps = game.bob_steps * np.count_nonzero(~there, axis=1)
         if observe:
             observe(worlds.states)
-        for step in range(game.bob_steps):
+        for step in range(most_steps):
             if not playing.size:
                 break
             observation = bob_observation(worlds.positions()[playing], choice.goal[playing])
@@ -310,7 +313,7 @@ class SelfPlay:
             num_held = np.where(reached.all(axis=1), num_held + 1, 0)
             over = num_held >= game.bob_hold_steps
             turns.terminated[step, playing] = over[playing]
-            playing = playing[~(over | diverged)[playing]]
+            playing = playing[~(over | diverged | (num_steps == step + 1))[playing]]
         turns.final_value_observation[:] = worlds.bob_value(choice.goal)
         solved: BoolArray = np.all(there, axis=1)
         return turns, solved, diverged

@@ -34,7 +34,9 @@ class GameConfig(FrozenModel):
         description="a round's length is drawn from here to ``alice_steps``; None: always ``alice_steps``. Short turns "
         "make her lift early, long ones reach objects far from the gripper",
     )
-    bob_steps: int = Field(40, ge=1)
+    bob_steps: int = Field(
+        40, ge=1, description="most steps of his turn, for each object that is not at its goal at the start"
+    )
     success_distance_m: float = Field(0.05, gt=0.0, description="paper: 5 cm; also the least move of a valid goal")
     alice_valid_reward: float = Field(1.0, description="paper, appendix")
     alice_difficult_reward: float = Field(5.0, description="paper, appendix: added when Bob fails")

@@ -11,6 +11,7 @@ which is a signed permutation of each vector.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -44,6 +45,9 @@ class Normalisation:
 
     offset: FloatArray
     scale: FloatArray
+    by_object: NDArray[np.int64] | None = None
+    """(M, n) columns of what each of M objects that are alike has, first of all its way from the end effector. Networks
+    see the nearest of them first, so what is learned of one is learned of all. None where there are no such."""
 
 
 class Kind(NamedTuple):
@@ -88,10 +92,13 @@ class Entry:
 
 
 class ObservationLayout:
-    """Named entries, one after the other, of an observation or action vector."""
+    """Named entries, one after the other, of an observation or action vector.
 
-    def __init__(self, *entries: Entry) -> None:
-        self.entries = entries
+    ``alike`` are the numbers of objects that differ in nothing that a policy could use.
+    """
+
+    def __init__(self, *entries: Entry, alike: Sequence[int] = ()) -> None:
+        self.entries, self.alike = entries, tuple(alike)
         self.columns = columns({entry.name: len(entry.kind.source) for entry in entries})
         """Slices by the entries' names."""
         assert len(self.columns) == len(entries), "two entries of the same name"
@@ -99,11 +106,11 @@ class ObservationLayout:
 
     def __add__(self, other: ObservationLayout) -> ObservationLayout:
         """These entries, then those of ``other``."""
-        return ObservationLayout(*self.entries, *other.entries)
+        return ObservationLayout(*self.entries, *other.entries, alike=self.alike)
 
-    def of(self, num_objects: int) -> ObservationLayout:
+    def of(self, num_objects: int, alike: Sequence[int] = ()) -> ObservationLayout:
         """The same in a world of so many objects."""
-        return ObservationLayout(*(entry.of(num_objects) for entry in self.entries))
+        return ObservationLayout(*(entry.of(num_objects) for entry in self.entries), alike=alike)
 
     def __getitem__(self, name: str) -> slice:
         """Columns of an entry."""
@@ -116,25 +123,23 @@ class ObservationLayout:
         sign = [entry.kind.sign for entry in self.entries]
         return Mirror(np.concatenate(source), np.concatenate(sign).astype(np.float32))
 
-    def exchange(self, one: int, other: int, num_objects: int) -> Mirror:
-        """Exchange of two objects in a vector, which is a permutation as a reflection is one."""
-        source = np.arange(self.size)
-        for entry in self.entries:
-            if entry.of_each_object:
-                columns = source[self[entry.name]].reshape(num_objects, -1)  # a view
-                columns[[one, other]] = columns[[other, one]]
-        return Mirror(source, np.ones(self.size, dtype=np.float32))
-
     @cached_property
     def normalisation(self) -> Normalisation:
         """Scaling of the whole vector."""
         offset, scale = np.empty(self.size, dtype=np.float32), np.empty(self.size, dtype=np.float32)
         for entry in self.entries:
             offset[self[entry.name]], scale[self[entry.name]] = entry.offset, entry.scale
-        return Normalisation(offset, scale)
+        return Normalisation(offset, scale, self._by_object() if self.alike else None)
+
+    def _by_object(self) -> NDArray[np.int64]:
+        names = [entry.name for entry in self.entries if entry.of_each_object and entry.name != _FROM_EFFECTOR]
+        num = (self[_FROM_EFFECTOR].stop - self[_FROM_EFFECTOR].start) // 3
+        each = [np.arange(self[name].start, self[name].stop).reshape(num, -1) for name in (_FROM_EFFECTOR, *names)]
+        return np.concatenate(each, axis=1)[list(self.alike)]
 
 
 _MIDDLE_M = (0.0, 0.0, 0.15)
+_FROM_EFFECTOR = "object_from_effector"
 
 ACTION = ObservationLayout(
     Entry("displacement", VECTOR, "share of the greatest", 0.0, 1.0),
@@ -145,7 +150,7 @@ POSITIONS = ObservationLayout(
     Entry("effector", VECTOR, "m", _MIDDLE_M, 0.12),
     Entry("fingers", PAIR, "m", 0.02, 0.02),
     Entry("object", VECTOR, "m", _MIDDLE_M, 0.12, of_each_object=True),
-    Entry("object_from_effector", VECTOR, "m", 0.0, 0.1, of_each_object=True),
+    Entry(_FROM_EFFECTOR, VECTOR, "m", 0.0, 0.1, of_each_object=True),
 )
 """Input of Bob's primitives in the paper, and the first entries of theirs in every world, there for each object."""
 _MOTION = ObservationLayout(
@@ -176,10 +181,17 @@ class Layouts:
         num_obstacles: obstacles whose positions they see.
         delay: whether they see how late commands are.
         num_objects: K.
+        alike: those of them that are alike, or none.
     """
 
     def __init__(
-        self, num_commands: int = 0, num_obstacles: int = 0, *, delay: bool = False, num_objects: int = 1
+        self,
+        num_commands: int = 0,
+        num_obstacles: int = 0,
+        *,
+        delay: bool = False,
+        num_objects: int = 1,
+        alike: Sequence[int] = (),
     ) -> None:
         motion, goal, self.way = (each.of(num_objects) for each in (_MOTION, _GOAL, _GOAL_FROM_OBJECT))
         self.num_objects = num_objects
@@ -191,7 +203,7 @@ class Layouts:
             for age in range(num_commands)
         )
         further = ObservationLayout(*obstacles, *commands, *([_DELAY] if delay else []))
-        self.positions = POSITIONS.of(num_objects) + further
+        self.positions = POSITIONS.of(num_objects, alike) + further
         """Input of Bob's primitives."""
         self.full = self.positions + motion + _ELAPSED
         """Input of Alice's policy and of her value network."""
@@ -213,8 +225,20 @@ def layouts(world: WorldConfig) -> Layouts:
     """Layouts of worlds of a configuration."""
     observed = world.observed
     return Layouts(
-        observed.num_commands, world.num_observed_obstacles, delay=observed.delay, num_objects=world.num_objects
+        observed.num_commands,
+        world.num_observed_obstacles,
+        delay=observed.delay,
+        num_objects=world.num_objects,
+        alike=_alike(world),
     )
+
+
+def _alike(world: WorldConfig) -> list[int]:
+    """The most objects that differ in color alone, which no policy sees; none where all differ."""
+    kinds = [body.model_dump(exclude={"color"}) for body in world.bodies]
+    groups = [[number for number, other in enumerate(kinds) if other == kind] for kind in kinds]
+    most = max(groups, key=len)
+    return most if len(most) > 1 else []
 
 
 PAPER = Layouts()

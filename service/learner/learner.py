@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 
 import numpy as np
 import torch
@@ -24,11 +23,7 @@ from service.learner.samples import (
     DemonstrationHistory,
     DemonstrationRows,
     Samples,
-    Symmetry,
-    exchange,
-    exchange_at_random,
-    reflection,
-    transform_at_random,
+    reflect_at_random,
 )
 from service.policies import networks
 
@@ -194,25 +189,14 @@ class Learner:
         metrics = ppo.update(self._alice, samples, imitated, how, self._rng, version=self.version)
         return _prefixed("alice", metrics) | counted
 
-    def _exchanges(self) -> list[Symmetry]:
-        """Exchanges of objects that are alike but for their color."""
-        alike = [body.model_dump(exclude={"color"}) for body in self.config.world.bodies]
-        pairs = combinations(range(len(alike)), 2)
-        return [exchange(self._layouts, one, other) for one, other in pairs if alike[one] == alike[other]]
-
     def _update_bob(self, rollouts: Sequence[Rollout]) -> Metrics:
         config, bob = self.config.learner, self._bob
         samples = ppo.collect([rollout.bob for rollout in rollouts], bob)
         metrics = {"num_bob_samples": float(_num(samples))}
         mirrored, helped = self._mirrored, solved_share(rollouts) <= config.bob_help_max_success
-        exchanges = self._exchanges() if config.bob.mirror == "random" else []
-        if samples is not None and helped:
-            for symmetry in [*([reflection(self._layouts)] if mirrored else []), *exchanges]:
-                samples = transform_at_random(samples, symmetry, bob, self._rng)
-        shown = [each.demonstrations for each in rollouts]
-        for symmetry in exchanges:
-            shown = [exchange_at_random(each, symmetry, self._rng) for each in shown]
-        demonstrations = self._to_clone(DEMONSTRATIONS, shown)
+        if samples is not None and mirrored and helped:
+            samples = reflect_at_random(samples, self._layouts, bob, self._rng)
+        demonstrations = self._to_clone(DEMONSTRATIONS, [each.demonstrations for each in rollouts])
         metrics["num_demonstrations"] = float(_num(demonstrations) // (1 + mirrored))
         updated = ppo.update(
             bob, samples, demonstrations if helped else None, config.abc, self._rng, version=self.version

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -146,32 +146,12 @@ class DemonstrationHistory:
         return join_demonstrations([self._nothing, *parts])
 
 
-class Symmetry(NamedTuple):
-    """What leaves the task as it is: a reflection in y, or an exchange of two objects that are alike."""
-
-    observation: Mirror
-    """Of Bob's input."""
-    value_observation: Mirror
-    action: Mirror
-
-
-def reflection(seen: Layouts) -> Symmetry:
-    """Reflection in y."""
-    return Symmetry(seen.bob.mirror, seen.bob_value.mirror, ACTION.mirror)
-
-
-def exchange(seen: Layouts, one: int, other: int) -> Symmetry:
-    """Exchange of two objects."""
-    bob, value = (each.exchange(one, other, seen.num_objects) for each in (seen.bob, seen.bob_value))
-    return Symmetry(bob, value, Mirror(np.arange(ACTION.size), np.ones(ACTION.size, dtype=np.float32)))
-
-
-def transform_at_random(samples: Samples, symmetry: Symmetry, bob: Player, rng: np.random.Generator) -> Samples:
-    """Replace half of Bob's samples, chosen at random, by their images."""
+def reflect_at_random(samples: Samples, seen: Layouts, bob: Player, rng: np.random.Generator) -> Samples:
+    """Replace half of Bob's samples, chosen at random, by their reflections in y."""
     places = np.flatnonzero(rng.random(len(samples)) < 0.5)
-    images = _images(samples.take(places), symmetry, bob)
+    reflections = _reflections(samples.take(places), seen, bob)
     rows = torch.from_numpy(places).to(samples.observation.device)
-    pairs = zip(samples.columns(), images.columns(), strict=True)
+    pairs = zip(samples.columns(), reflections.columns(), strict=True)
     return Samples(*(column.index_copy(0, rows, reflected) for column, reflected in pairs))
 
 
@@ -210,30 +190,22 @@ def _draw(num_rows: int, num: int, rng: np.random.Generator) -> IntArray:
     return np.concatenate([np.zeros(0, dtype=np.int64), *rounds])[:num]
 
 
-def exchange_at_random(demonstrations: Demonstrations, symmetry: Symmetry, rng: np.random.Generator) -> Demonstrations:
-    """Exchange two objects in half of Bob's demonstrations, chosen at random."""
-    chosen = rng.random((len(demonstrations.observation), 1)) < 0.5
-    observation = np.where(chosen, symmetry.observation(demonstrations.observation), demonstrations.observation)
-    return Demonstrations(observation, demonstrations.action)
-
-
-def _images(samples: Samples, symmetry: Symmetry, bob: Player) -> Samples:
-    """Reflect Bob's samples, or exchange their objects.
+def _reflections(samples: Samples, seen: Layouts, bob: Player) -> Samples:
+    """Reflect Bob's samples.
 
     A reflection was acted by the reflected behaviour policy, so it has the behaviour log-probability of its original.
     The importance weight, or without ``decoupled`` PPO's ratio, then says how much it counts: little, where he
     would hardly act like that. With a full weight one reflection in ten, tens of standard deviations from the mean,
     ruled the gradient.
     """
-    observations = _reflect(samples.observation, symmetry.observation)
-    actions = _reflect(samples.action, symmetry.action)
+    observations = _reflect(samples.observation, seen.bob.mirror)
     with torch.no_grad():
         mean, std = bob.policy(observations)
     return replace(
         samples,
         observation=observations,
-        value_observation=_reflect(samples.value_observation, symmetry.value_observation),
-        action=actions,
+        value_observation=_reflect(samples.value_observation, seen.bob_value.mirror),
+        action=_reflect(samples.action, ACTION.mirror),
         proximal_mean=mean,
         proximal_std=std,
     )

@@ -48,7 +48,7 @@ def take_over(
         return f"not taken, {len(missing)} parameters are not in both, such as {missing[0]}"
     fitted = {}
     for name, tensor in own.items():
-        if name not in given:
+        if name not in given or name.endswith("by_object"):  # columns of the layout
             continue
         array = torch.from_numpy(np.array(given[name], dtype=np.float32))
         if array.shape != tensor.shape:

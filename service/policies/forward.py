@@ -80,6 +80,7 @@ def prepared(xp: Any, parameters: Parameters) -> dict[str, Any]:
         name: xp.ascontiguousarray(array.T) if name.endswith(".weight") else array[()]  # scalars are faster so
         for name, array in parameters.items()
     }
+    ready |= {name: array.astype(int) for name, array in parameters.items() if name.endswith(".by_object")}
     for squash, bias in (("squash", "output.bias"), ("primitives.squash", "primitives.output_bias")):
         if bias in parameters:
             low, high = ready.pop(f"{squash}.log_std_min"), ready.pop(f"{squash}.log_std_max")
@@ -121,7 +122,7 @@ def orchestrator(
     features += [positions[:, columns[name]] - previous_positions[:, columns[name]] for name in ("effector", "object")]
     features += [goal, goal - positions[:, columns["object"]]]
     seen = xp.concatenate(features, 1)
-    seen = _normalised(xp, seen, parameters["actor.input.offset"], parameters["actor.input.scale"])
+    seen = _normalised(xp, seen, parameters, "actor.input")
     output = relu_layers(xp, parameters["actor.layers"], seen)
     chosen = xp.tanh(output[:, : output.shape[1] // 2])
     means, variances = primitives(xp, parameters, positions)
@@ -141,7 +142,7 @@ FUNCTIONS: Mapping[str, Callable[..., Outputs]] = {
 
 def gaussian(xp: Any, parameters: Parameters, observation: Array) -> tuple[Array, Array]:
     """Mean and log-std, (N, A) each, of Alice or a monolithic Bob at (N, O) observations."""
-    hidden = _normalised(xp, observation, parameters["input.offset"], parameters["input.scale"])
+    hidden = _normalised(xp, observation, parameters, "input")
     hidden = _elu_layers(xp, parameters["hidden"], hidden)
     output = _linear(hidden, parameters["output.weight"], parameters["output.bias"])
     return _halves(_squash(xp, output, parameters["squash.low"], parameters["squash.span"]))
@@ -149,7 +150,7 @@ def gaussian(xp: Any, parameters: Parameters, observation: Array) -> tuple[Array
 
 def primitives(xp: Any, parameters: Parameters, positions: Array) -> tuple[Array, Array]:
     """Means and variances, (N, K, A) each, at (N, P) positions; the K heads share one matrix product per layer."""
-    trunk = _normalised(xp, positions, parameters["primitives.input.offset"], parameters["primitives.input.scale"])
+    trunk = _normalised(xp, positions, parameters, "primitives.input")
     trunk = _elu_layers(xp, parameters["primitives.trunk"], trunk)
     hidden = _elu(xp, _linear(trunk, parameters["primitives.hidden.weight"], parameters["primitives.hidden.bias"]))
     weight = parameters["primitives.output_weight"]
@@ -165,7 +166,7 @@ def gate(xp: Any, parameters: Parameters, columns: Columns, observation: Array) 
     """Weights (N, K) at (N, O) observations: each in [floor, 1], and not of sum one, as in the paper."""
     way = observation[:, columns["goal"]] - observation[:, columns["object"]]
     hidden = xp.concatenate((observation, way), 1)
-    hidden = _normalised(xp, hidden, parameters["gate.input.offset"], parameters["gate.input.scale"])
+    hidden = _normalised(xp, hidden, parameters, "gate.input")
     hidden = _elu_layers(xp, parameters["gate.hidden"], hidden)
     floor = parameters["gate.weight_floor"]
     output = _linear(hidden, parameters["gate.output.weight"], parameters["gate.output.bias"])
@@ -215,11 +216,24 @@ def _elu_layers(xp: Any, layers: Layers, rows: Array) -> Array:
     return rows
 
 
-def _normalised(xp: Any, rows: Array, offset: Array, scale: Array) -> Array:
-    rows = rows - offset
-    rows /= scale
+def _normalised(xp: Any, rows: Array, parameters: Parameters, name: str) -> Array:
+    if f"{name}.by_object" in parameters:
+        rows = _nearest_first(xp, rows, parameters[f"{name}.by_object"])
+    rows = rows - parameters[f"{name}.offset"]
+    rows /= parameters[f"{name}.scale"]
     rows = xp.maximum(rows, -INPUT_CLIP, out=rows)
     return xp.minimum(rows, INPUT_CLIP, out=rows)
+
+
+def _nearest_first(xp: Any, rows: Array, by_object: Array) -> Array:
+    """Sort what (N, O) rows have of objects that are alike, (M, n) columns, by their distance from the end effector.
+
+    The first three numbers of each are its way from there.
+    """
+    objects, rows = rows[:, by_object], rows.copy()
+    order = xp.argsort((objects[:, :, :3] ** 2).sum(-1), axis=1, kind="stable")
+    rows[:, by_object] = xp.take_along_axis(objects, order[:, :, None], 1)
+    return rows
 
 
 def _linear(rows: Array, weight: Array, bias: Array) -> Array:

@@ -60,19 +60,35 @@ def elu(values: Tensor) -> Tensor:
 
 
 class InputNormalisation(nn.Module):
-    """Fixed normalisation, clipped to +- ``INPUT_CLIP``; its constants travel with the parameters."""
+    """Fixed normalisation, clipped to +- ``INPUT_CLIP``; its constants travel with the parameters.
+
+    Of objects that are alike the nearest comes first.
+    """
 
     offset: Tensor
     scale: Tensor
+    by_object: Tensor | None
 
     def __init__(self, normalisation: Normalisation) -> None:
         super().__init__()
         self.register_buffer("offset", torch.tensor(normalisation.offset))
         self.register_buffer("scale", torch.tensor(normalisation.scale))
+        columns = normalisation.by_object
+        self.register_buffer("by_object", None if columns is None else torch.tensor(columns))
 
     def forward(self, values: Tensor) -> Tensor:
         """Normalise (..., O)."""
+        if self.by_object is not None:
+            values = nearest_first(values, self.by_object)
         return ((values - self.offset) / self.scale).clamp(-INPUT_CLIP, INPUT_CLIP)
+
+
+def nearest_first(values: Tensor, by_object: Tensor) -> Tensor:
+    """Sort what (..., O) rows have of objects by their distance from the end effector; see ``Normalisation``."""
+    objects = values[..., by_object]
+    order = objects[..., :3].square().sum(-1).argsort(dim=-1, stable=True)
+    in_order = objects.gather(-2, order[..., None].expand_as(objects))
+    return values.index_copy(-1, by_object.flatten(), in_order.flatten(-2))
 
 
 class HiddenLayer(nn.Linear):

@@ -23,6 +23,7 @@ from service.policies.parameters import (
     checked,
     gaussian_shapes,
     layer_sizes,
+    order_shapes,
     shape_of,
 )
 
@@ -69,7 +70,7 @@ class NumpyGaussianPolicy(NumpyPolicy):
             PolicyError: a parameter is missing, left over, of a wrong shape or not finite.
         """
         (self._num_inputs,) = shape_of(parameters, "input.offset", 1)
-        expected = gaussian_shapes(self._num_inputs, layer_sizes(parameters, "hidden.{}"))
+        expected = gaussian_shapes(self._num_inputs, layer_sizes(parameters, "hidden.{}")) | order_shapes(parameters)
         self.network, self.columns = forward.prepared(np, checked(parameters, expected)), {}
 
     def distribution(self, observation: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -99,7 +100,7 @@ class NumpyMCPPolicy(NumpyPolicy):
         of_objects = slice(first, first + self.num_goal)
         self.columns = {"positions": slice(0, self.num_positions), "object": of_objects, "goal": goal}
         expected = bob_shapes(self.num_positions, self.num_goal, trunk, (self.num_primitives, head_size), gate)
-        self.network = forward.prepared(np, checked(parameters, expected))
+        self.network = forward.prepared(np, checked(parameters, expected | order_shapes(parameters)))
 
     def primitives(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Means and variances, (..., K, A) each, of the primitives at (..., P) positions.

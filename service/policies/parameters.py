@@ -62,6 +62,23 @@ def gaussian_shapes(num_inputs: int, hidden: Sequence[int]) -> Shapes:
     }
 
 
+def order_shapes(parameters: Parameters) -> Shapes:
+    """Shapes of the columns by object that are there, of networks that see the nearest object first.
+
+    Raises:
+        PolicyError: they are no columns of their inputs.
+    """
+    names = [name for name in parameters if name.endswith("input.by_object")]
+    for name in names:
+        shape_of(parameters, name, 2)
+        columns, (num,) = parameters[name], shape_of(parameters, name.replace("by_object", "offset"), 1)
+        if not np.isin(columns, np.arange(num)).all() or len(np.unique(columns)) < columns.size:
+            raise PolicyError(
+                f"policy parameter {name!r}: expected different columns from 0 to {num - 1}; export it again"
+            )
+    return {name: np.shape(parameters[name]) for name in names}
+
+
 def layer_shapes(name: str, sizes: Sequence[int], step: int = 1) -> Shapes:
     """Weights (outputs, inputs) and biases between every two neighbours of ``sizes``.
 

@@ -107,17 +107,17 @@ def test_one_rests_on_the_other(worlds):
     np.testing.assert_allclose(red - blue, [0.0, 0.0, 0.05], atol=2e-3)
 
 
-def test_an_exchange_of_two_by_hand():
-    seen = layouts(WorldConfig(objects=("cube", "cube", "cube")))
-    layout = seen.bob
-    vector = np.arange(layout.size, dtype=np.float32)
-    swapped = layout.exchange(0, 2, 3)(vector)
-    first, second, third = np.split(np.arange(9), 3)
-    for name in ("object", "object_from_effector", "goal"):
-        start = layout[name].start
-        assert swapped[layout[name]].tolist() == [*(start + third), *(start + second), *(start + first)]
-    assert swapped[layout["effector"]].tolist() == vector[layout["effector"]].tolist()
-    np.testing.assert_array_equal(layout.exchange(0, 2, 3)(swapped), vector)
+def test_columns_of_objects_that_are_alike_by_hand():
+    cylinder = {"shape": "cylinder", "size_m": [0.05, 0.05]}
+    seen = layouts(WorldConfig(objects=("cube", cylinder, "cube")))
+    # effector 3, fingers 2, objects 9, their ways from the effector 9, goals 9
+    assert seen.bob.normalisation.by_object.tolist() == [
+        [14, 15, 16, 5, 6, 7, 23, 24, 25],
+        [20, 21, 22, 11, 12, 13, 29, 30, 31],
+    ]
+    assert seen.full.normalisation.by_object.shape == (2, 3 + 3 + 3 + 2)
+    assert layouts(WorldConfig(objects=("cube", cylinder))).bob.normalisation.by_object is None
+    assert layouts(WorldConfig()).bob.normalisation.by_object is None
 
 
 def test_a_reflection_keeps_the_objects_apart(worlds):

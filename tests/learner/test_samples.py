@@ -13,8 +13,7 @@ from service.learner.ppo import advantages, collect
 from service.learner.samples import (
     DemonstrationRows,
     draw_epoch,
-    reflection,
-    transform_at_random,
+    reflect_at_random,
 )
 from tests.learner.rollouts import make_turns, nobody_learns
 
@@ -96,7 +95,7 @@ def test_equal_advantages_become_zero():
 
 def test_half_of_the_samples_are_reflected_at_random():
     samples = collect([make_bob_turns()], PLAYER)
-    mixed = transform_at_random(samples, reflection(PAPER), PLAYER, np.random.default_rng(0))
+    mixed = reflect_at_random(samples, PAPER, PLAYER, np.random.default_rng(0))
     chosen = np.random.default_rng(0).random(len(samples)) < 0.5
     assert 0.3 < chosen.mean() < 0.7
     for before, after in zip(samples.columns(), mixed.columns(), strict=True):

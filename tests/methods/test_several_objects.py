@@ -13,8 +13,6 @@ from service.config.recipes import recipes
 from service.envs.observations import distances, each_object
 from service.envs.tasks import find_task
 from service.export.exporting import export
-from service.learner import learner as learning
-from service.methods.self_play import LocalSelfPlay
 from service.methods.task import _mixed
 from service.robot.play.game import Game
 from service.robot.running import for_robot
@@ -45,27 +43,6 @@ def test_it_is_published_with_what_it_was_measured_on(path):
     assert found.manifest.spaces["observation"] == 23
     assert {"evaluation/one_success_last", "evaluation/mixed_success_last"} <= found.manifest.metrics.keys()
     assert service.evaluate(found, goals="one", num_episodes=3).num_episodes == 3
-
-
-def test_bobs_samples_and_demonstrations_are_exchanged(path, monkeypatch):
-    config, calls = load_config(path / "two.yaml", SHORT), []
-    for name in ("transform_at_random", "exchange_at_random"):
-        real = getattr(learning, name)
-        monkeypatch.setattr(learning, name, lambda *given, real=real, name=name: calls.append(name) or real(*given))
-    with_two = LocalSelfPlay(config)
-    for _ in range(2):
-        with_two.step()
-    with_two.close()
-    assert calls.count("transform_at_random") >= 2  # reflected and exchanged
-    assert "exchange_at_random" in calls
-    alike = learning.Learner(config)._exchanges()
-    assert len(alike) == 1
-    seen = alike[0].value_observation
-    np.testing.assert_array_equal(np.sort(seen.source), np.arange(44))
-    assert (seen.source != np.arange(44)).sum() == 2 * (5 * 3 + 2)  # five vectors and the contacts of each
-    cylinder = {"shape": "cylinder", "size_m": [0.04, 0.05]}
-    other = config.model_copy(update={"world": config.world.model_validate(WORLD | {"objects": ["cube", cylinder]})})
-    assert learning.Learner(other)._exchanges() == []
 
 
 def test_hindsight_takes_for_each_object_what_was_achieved_or_asked_for():

@@ -46,7 +46,7 @@ class Game:
         self.world = players.world
         self.take(players)
         self._alice_steps, self._num_rounds = rules.alice_steps, rules.num_goals
-        self._bob_steps = players.num_steps if on_task else rules.bob_steps
+        self._bob_steps = players.num_steps if on_task else rules.bob_steps * self.world.num_objects
         self._hold_steps = (players.num_steps // 4 or 1) if on_task else max(rules.bob_hold_steps, 1)
         self._rng = np.random.default_rng(seed)
         self.worlds = WorldBatch(self.world, 1, num_threads=1)
