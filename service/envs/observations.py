@@ -194,7 +194,7 @@ class Layouts:
         alike: Sequence[int] = (),
     ) -> None:
         motion, goal, self.way = (each.of(num_objects) for each in (_MOTION, _GOAL, _GOAL_FROM_OBJECT))
-        self.num_objects = num_objects
+        self.num_objects, self.alike = num_objects, tuple(alike)
         obstacles = (
             Entry(f"{OBSTACLE_PREFIX}{number + 1}", VECTOR, "m", _MIDDLE_M, 0.12) for number in range(num_obstacles)
         )

@@ -36,6 +36,8 @@ def take_over(
     """
     if before.num_objects != after.num_objects:
         return f"not taken, it was trained with {before.num_objects} objects, here is {after.num_objects}"
+    if before.alike != after.alike:
+        return "not taken, it was trained with objects of which others are alike"
     for seen in inputs:
         old, new = getattr(before, seen), getattr(after, seen)
         if old.size == new.size and old.columns != new.columns:  # by their shapes the weights would fit

@@ -56,13 +56,19 @@ def test_it_computes_what_the_trained_one_did(name, before, after):
 
 
 def test_policies_of_two_objects():
-    two, wider = Layouts(num_objects=2), Layouts(num_commands=2, num_objects=2)
+    two, wider = (Layouts(num_commands=num, num_objects=2, alike=(0, 1)) for num in (0, 2))
     torch.manual_seed(0)
-    trained = networks.export_parameters(networks.make_bob(SMALL, two))
-    said = take_over(networks.make_bob(SMALL, wider), trained, two, wider, BOB_INPUTS)
-    assert said == "taken: new command_1, command_2"
-    said = take_over(networks.make_bob(SMALL, PAPER), trained, two, PAPER, BOB_INPUTS)
+    trained, new = networks.make_bob(SMALL, two), networks.make_bob(SMALL, wider)
+    parameters = networks.export_parameters(trained)
+    assert take_over(new, parameters, two, wider, BOB_INPUTS) == "taken: new command_1, command_2"
+    rows = rows_of(two.bob, {})
+    same = rows_of(wider.bob, {entry: rows[:, part] for entry, part in two.bob.columns.items()})
+    torch.testing.assert_close(outputs(new, same), outputs(trained, rows))  # the nearest is first in both
+    said = take_over(networks.make_bob(SMALL, PAPER), parameters, two, PAPER, BOB_INPUTS)
     assert said == "not taken, it was trained with 2 objects, here is 1"
+    other = Layouts(num_objects=2)
+    said = take_over(networks.make_bob(SMALL, other), parameters, two, other, BOB_INPUTS)
+    assert said == "not taken, it was trained with objects of which others are alike"
 
 
 def test_inputs_that_are_gone_are_left_out():
