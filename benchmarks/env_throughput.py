@@ -151,7 +151,7 @@ def benchmark(settings: Settings) -> dict[str, Any]:
 
 
 def measure_rows(rows: Mapping[str, BatchContender | GymnasiumContender], settings: Settings) -> dict[str, Any]:
-    """Median rates of the given rows, and how many times as fast as panda-gym ours are; for JSON."""
+    """Median rates of the given rows, and ratios of those that are compared; for JSON."""
     plays = {name: row.episode for name, row in rows.items()}
     samples = measure_in_turn(plays, settings.num_pairs, settings.seconds)
     ratios = {

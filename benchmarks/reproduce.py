@@ -4,7 +4,7 @@
     python -m benchmarks.reproduce --parallel 2
 
 That is the table of downstream tasks and skill discovery, some sixty hours of one core, by today's version of what
-learns; ``docs/results`` has the table of version 1 until this one is whole.
+learns.
 Each is one or more of the commands that anybody can type, and this prints them. What was stopped goes on from its run
 directory. Pictures and pages are made from the files afterwards, by ``python -m benchmarks.report``.
 """

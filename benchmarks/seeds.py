@@ -30,7 +30,7 @@ from service.store.checkpoints import read_checkpoint
 from service.store.run_directory import RunDirectory
 
 KINDS = ("mixed", "table", "air", "larger", "one")
-"""Of goals, where the world has them: the last are for several objects."""
+"""Of goals, where the world has them: the last is for several objects."""
 NUM_EPISODES, SEED = 1_000, 1
 """Of what is measured; the seed of the goals is another than those of evaluations during a run."""
 NUM_EVALUATED = 300

@@ -105,6 +105,7 @@ class Report:
         found = read_all(self._results, FILES)
         runs = [run for run in read_all(self._results / "runs").values() if "ablation" not in run]
         trials = list(read_all(self._results / RESULTS.name / "downstream").values())
+        # of version 1 until those of today's are whole
         recorded_skills = list(read_all(self._results / "skills").values())
         for page, names in PAGES.items():  # what is wrong with a page is found before anything is drawn
             words = replace_blocks(self._docs / page, dict.fromkeys(names, ""))

@@ -14,6 +14,7 @@ from benchmarks.report.results import TRIAL, Result, by_method_and_task
 from benchmarks.run_files import steps_until
 from service.base.errors import TandemError
 from service.base.files import write_atomic
+from service.base.version import LEARNING_VERSION
 from service.envs.tasks import PAPERS, TASKS, find_task
 from service.media.figures import BLUE, FAINT, GREEN, ORANGE, new_figure, save, style_axes
 from service.methods.task_evaluation import rate_of
@@ -64,8 +65,9 @@ def write_page(results: Sequence[Result]) -> str:
     check_versions(results)
     of = by_method_and_task(results)
     parts = [
-        "# Downstream\n\nWritten by `python -m benchmarks.report` from the files in `v2/downstream/`, one for each "
-        "trial, a method on a task with a seed;\n[what the tasks and methods are](../downstream.md).\n",
+        "# Downstream\n\nWritten by `python -m benchmarks.report` from the files in "
+        f"`v{LEARNING_VERSION}/downstream/`, one for each trial, a method on a task with a seed;\n"
+        "[what the tasks and methods are](../downstream.md).\n",
         "## Success at the last step\n",
         "Mean of the seeds; in brackets their number. The interval is one of 95 % for the mean over seeds (Student's "
         "t). A single seed has Wilson's over its episodes instead, marked by a star: it says how far the share may be "

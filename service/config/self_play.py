@@ -35,7 +35,10 @@ class GameConfig(FrozenModel):
         "make her lift early, long ones reach objects far from the gripper",
     )
     bob_steps: int = Field(
-        40, ge=1, description="most steps of his turn, for each object that is not at its goal at the start"
+        40,
+        ge=1,
+        description="most steps of his turn, for each object that is not at its goal at the start; where all are, for "
+        "each of them",
     )
     success_distance_m: float = Field(0.05, gt=0.0, description="paper: 5 cm; also the least move of a valid goal")
     alice_valid_reward: float = Field(1.0, description="paper, appendix")

@@ -41,7 +41,7 @@ class Mirror:
 
 @dataclass(frozen=True)
 class Normalisation:
-    """Fixed affine input scaling ``(v - offset) / scale``; constants, so a frozen primitive needs no statistics."""
+    """Fixed input scaling ``(v - offset) / scale``, and an order of objects; so primitives need no statistics."""
 
     offset: FloatArray
     scale: FloatArray
@@ -234,7 +234,7 @@ def layouts(world: WorldConfig) -> Layouts:
 
 
 def _alike(world: WorldConfig) -> list[int]:
-    """The most objects that differ in color alone, which no policy sees; none where all differ."""
+    """Numbers of the largest group of objects that differ in color alone, which no policy sees; or none."""
     kinds = [body.model_dump(exclude={"color"}) for body in world.bodies]
     groups = [[number for number, other in enumerate(kinds) if other == kind] for kind in kinds]
     most = max(groups, key=len)

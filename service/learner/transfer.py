@@ -37,7 +37,7 @@ def take_over(
     if before.num_objects != after.num_objects:
         return f"not taken, it was trained with {before.num_objects} objects, here is {after.num_objects}"
     if before.alike != after.alike:
-        return "not taken, it was trained with objects of which others are alike"
+        return f"not taken, objects {_numbers(before)} were alike where it was trained, here {_numbers(after)} are"
     for seen in inputs:
         old, new = getattr(before, seen), getattr(after, seen)
         if old.size == new.size and old.columns != new.columns:  # by their shapes the weights would fit
@@ -64,6 +64,10 @@ def take_over(
     new, gone = sorted(sees - saw), sorted(saw - sees)
     notes = [f"{word} {', '.join(names)}" for word, names in (("new", new), ("left out", gone)) if names]
     return f"taken{': ' if notes else ''}{'; '.join(notes)}"
+
+
+def _numbers(seen: Layouts) -> str:
+    return ", ".join(str(number + 1) for number in seen.alike) or "none"
 
 
 def _with_inputs(

@@ -179,6 +179,11 @@ class Distillation(Method):
                 f"remember {kept}: raise world.observed.num_commands"
             )
         before, seen, given = layouts(start.world), layouts(world), start.networks["bob/policy"]
+        if before.alike != seen.alike:
+            raise TandemError(
+                f"--from {start.reference}: in its world other objects are alike than here, so it sees them in another "
+                "order; leave world.objects as it was"
+            )
         said = transfer.take_over(self._distiller.student, given, before, seen, transfer.BOB_INPUTS)
         self._distiller.begin()
         _logger.info("from %s: bob/policy: %s", start.reference, said)

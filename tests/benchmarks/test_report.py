@@ -125,7 +125,7 @@ def test_the_digest_that_a_page_calls_the_champion_is_the_bundled_ones():
     )
     assert f"parameters `{digest[:12]}`" in words
     of_the_seed = service.load(f"panda-cube@seed-{seed}", registry=RESULTS / "primitives")
-    assert parameters_digest(of_the_seed.primitives) == digest  # seed 0 of the next table rests on it
+    assert parameters_digest(of_the_seed.primitives) == digest  # seed 0 of the table rests on it
 
 
 def without_blocks(page):

@@ -68,7 +68,7 @@ def test_policies_of_two_objects():
     assert said == "not taken, it was trained with 2 objects, here is 1"
     other = Layouts(num_objects=2)
     said = take_over(networks.make_bob(SMALL, other), parameters, two, other, BOB_INPUTS)
-    assert said == "not taken, it was trained with objects of which others are alike"
+    assert said == "not taken, objects 1, 2 were alike where it was trained, here none are"
 
 
 def test_inputs_that_are_gone_are_left_out():

@@ -46,7 +46,7 @@ class Game:
         self.world = players.world
         self.take(players)
         self._alice_steps, self._num_rounds = rules.alice_steps, rules.num_goals
-        self._bob_steps = players.num_steps if on_task else rules.bob_steps * self.world.num_objects
+        self._bob_steps, self._task_steps = rules.bob_steps, players.num_steps if on_task else None
         self._hold_steps = (players.num_steps // 4 or 1) if on_task else max(rules.bob_hold_steps, 1)
         self._rng = np.random.default_rng(seed)
         self.worlds = WorldBatch(self.world, 1, num_threads=1)
@@ -206,7 +206,7 @@ class Game:
         if there:
             self.caption = "Solved" if own else f"At the goal, {100 * distance_m:.1f} cm away"
         put = self.mode == "goals" and not self.new_goals  # by hand, and so from anywhere: it may take longer
-        solved, late = self._held >= self._hold_steps, self._steps >= self._bob_steps * (1 + put)
+        solved, late = self._held >= self._hold_steps, self._steps >= self._most_steps() * (1 + put)
         if self.mode == "alice":
             if solved or late:
                 self._pause(f"Bob: solved after {self._seconds()}" if solved else "Bob: not solved", "round")
@@ -218,6 +218,13 @@ class Game:
                 self._draw_goal()
             else:
                 self._pause(f"There after {self._seconds()}", "reset")
+
+    def _most_steps(self) -> int:
+        """Of Bob's turn: an episode of the task, or what he has in self-play."""
+        if self._task_steps is not None:
+            return self._task_steps
+        away = distances(self._start_position, self.goal[None]) > self.players.success_distance_m
+        return self._bob_steps * (int(np.count_nonzero(away)) or self.world.num_objects)
 
     def _judge(self) -> None:
         """Take where Alice left the object for a goal, or say why it is none."""
