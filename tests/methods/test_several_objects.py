@@ -8,7 +8,7 @@ import pytest
 import service
 from service.base.errors import TandemError
 from service.cli.evaluate import parse_goals
-from service.config import load_config
+from service.config import load_config, parse_config
 from service.config.recipes import recipes
 from service.envs.observations import distances, each_object
 from service.envs.tasks import find_task
@@ -16,6 +16,8 @@ from service.export.exporting import export
 from service.methods.task import _mixed
 from service.robot.play.game import Game
 from service.robot.running import for_robot
+from service.runs.train import open_run
+from service.store.run_directory import RunDirectory
 from tests.runs.runs import TREE, write_yaml
 
 WORLD = TREE["world"] | {"objects": ["cube", "cube"], "object_size_m": 0.04}
@@ -82,8 +84,25 @@ def test_the_live_world_has_a_goal_for_each(two):
                 game.step()
         assert (each_object(game.goal) >= low).all()
         assert distances(game.worlds.object_position, game.goal[None]).shape == (1, 2)
+        steps = two.config.game.bob_steps
+        for way_m, num in (([0.1, 0.0], 1), ([0.1, -0.1], 2), ([0.0, 0.0], 2)):  # of each object, along x
+            game.set_mode("goals")
+            game.reset()
+            place = game.worlds.object_position[0].copy()
+            game.goal = place + np.repeat(way_m, 3) * np.tile([1.0, 0.0, 0.0], 2)
+            assert game._most_steps() == num * steps
     finally:
         game.close()
+
+
+def test_distillation_keeps_who_is_alike(two, tmp_path):
+    """Else its student would see the objects in another order than the teacher, and begin from nothing."""
+    other = {"shape": "box", "size_m": [0.04, 0.04, 0.04], "mass_kg": 0.7}
+    tree = {"method": "distillation", "world": WORLD | {"objects": ["cube", other]}, "policy": TREE["policy"]}
+    with pytest.raises(
+        TandemError, match=r"in its world other objects are alike than here, so it sees them in another"
+    ):
+        open_run(parse_config(tree, where="a test"), RunDirectory(tmp_path / "run"), start=two)
 
 
 def test_goals_are_typed_for_all(two):
