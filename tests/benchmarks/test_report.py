@@ -52,7 +52,7 @@ def test_the_committed_page_is_what_the_recorded_files_give(made, page):
 
 def test_the_committed_pictures_show_what_the_recorded_files_give(made):
     pictures = [path for path in made[1].files if path.suffix == ".png"]
-    assert len(pictures) == 8
+    assert len(pictures) == 9
     for picture in pictures:
         ours, theirs = (
             np.asarray(Image.open(path).convert("RGB"), dtype=np.int16)
