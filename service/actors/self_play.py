@@ -22,7 +22,7 @@ from service.base.types import Arrays, BoolArray, FloatArray, IntArray, Metrics,
 from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, bob_observation, distances, each_object
-from service.generator.bins import GoalCells
+from service.generator.bins import AIR_ABOVE_REST_M, GoalCells
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import GoalRecords
 from service.generator.ring import Rows
@@ -287,7 +287,7 @@ class SelfPlay:
         margin_m = game.bob_margin_m if players.version >= game.bob_margin_after_updates else 0.0
         reach_m = game.success_distance_m - margin_m
         playing = np.flatnonzero(choice.played)
-        there: BoolArray = distances(worlds.object_position, choice.goal) <= reach_m
+        there = self._at_goals(choice.goal, reach_m)
         # What lies at its goal counts as there, unless there is nothing else to do.
         there &= ~np.all(there, axis=1, keepdims=True)
         num_steps = game.bob_steps * np.count_nonzero(~there, axis=1)
@@ -306,7 +306,7 @@ class SelfPlay:
             if observe:
                 observe(worlds.states)
             self._count_reached(playing[~diverged[playing]])
-            reached = distances(worlds.object_position, choice.goal) <= reach_m
+            reached = self._at_goals(choice.goal, reach_m)
             # Reaching a goal earns the reward and leaving it takes the reward back; ``there`` is the step before.
             turns.reward[step, playing] = (self._worth(reached) - self._worth(there))[playing]
             there[playing] = reached[playing]
@@ -317,6 +317,15 @@ class SelfPlay:
         turns.final_value_observation[:] = worlds.bob_value(choice.goal)
         solved: BoolArray = np.all(there, axis=1)
         return turns, solved, diverged
+
+    def _at_goals(self, goal: StateArray, reach_m: float) -> BoolArray:
+        """(N, K) whether an object counts as at its goal, of (N, 3 K): within ``reach_m``, and let go of if asked."""
+        worlds, config = self.worlds, self.config
+        there: BoolArray = distances(worlds.object_position, goal) <= reach_m
+        if config.game.bob_lets_go:
+            lying = each_object(goal)[:, :, 2] <= np.add(config.world.rest_heights_m, AIR_ABOVE_REST_M / 2)
+            there &= ~(lying & worlds.contacts().reshape(*there.shape, 2).all(axis=2))
+        return there
 
     def _worth(self, there: BoolArray) -> FloatArray:
         """(N,) reward of having (N, K) objects at their goals."""
