@@ -35,6 +35,7 @@ export async function get(parts, query = [], signal = undefined) {
     return answer;
   }
   const problem = await response.json().catch(() => ({}));
+  signal?.throwIfAborted(); // nobody would ask again for a view that was left
   const detail = problem.detail ?? `the service answers ${response.status} ${response.statusText}`;
   if (response.status === 401) connection.dispatchEvent(new Event("locked"));
   else if (AWAY.has(response.status)) troubled(about, sentence(detail));
