@@ -22,7 +22,7 @@ from service.base.types import Arrays, BoolArray, FloatArray, IntArray, Metrics,
 from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, bob_observation, distances, each_object
-from service.generator.bins import AIR_ABOVE_REST_M, GoalCells
+from service.generator.bins import GoalCells, lying
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import GoalRecords
 from service.generator.ring import Rows
@@ -323,8 +323,8 @@ class SelfPlay:
         worlds, config = self.worlds, self.config
         there: BoolArray = distances(worlds.object_position, goal) <= reach_m
         if config.game.bob_lets_go:
-            lying = each_object(goal)[:, :, 2] <= np.add(config.world.rest_heights_m, AIR_ABOVE_REST_M / 2)
-            there &= ~(lying & worlds.contacts().reshape(*there.shape, 2).all(axis=2))
+            held = worlds.contacts().reshape(*there.shape, 2).all(axis=2)
+            there &= ~(held & lying(goal, config.world))
         return there
 
     def _worth(self, there: BoolArray) -> FloatArray:

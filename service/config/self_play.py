@@ -71,7 +71,7 @@ class GameConfig(FrozenModel):
     )
     bob_lets_go: bool = Field(
         False,
-        description="for Bob's reward, an object whose goal is on the table is there only while he does not hold it. "
+        description="in his turn an object whose goal is on the table counts as there only while he does not hold it. "
         "Of several objects he would hold the first one to the end (decision 48)",
     )
     bob_margin_m: float = Field(
