@@ -22,7 +22,7 @@ from service.base.types import Arrays, BoolArray, FloatArray, IntArray, Metrics,
 from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, bob_observation, distances, each_object
-from service.generator.bins import GoalCells, lying
+from service.generator.bins import GoalCells
 from service.generator.opponents import CURRENT, RoundPlan
 from service.generator.records import GoalRecords
 from service.generator.ring import Rows
@@ -319,13 +319,15 @@ class SelfPlay:
         return turns, solved, diverged
 
     def _at_goals(self, goal: StateArray, reach_m: float) -> BoolArray:
-        """(N, K) whether an object counts as at its goal, of (N, 3 K): within ``reach_m``, and let go of if asked."""
-        worlds, config = self.worlds, self.config
-        there: BoolArray = distances(worlds.object_position, goal) <= reach_m
-        if config.game.bob_lets_go:
-            held = worlds.contacts().reshape(*there.shape, 2).all(axis=2)
-            there &= ~(held & lying(goal, config.world))
-        return there
+        """(N, K) whether an object counts as at its goal, of (N, 3 K): within ``reach_m``.
+
+        What both fingers hold counts only once all others are there: he would hold the first one to the end.
+        """
+        there = distances(self.worlds.object_position, goal) <= reach_m
+        held = self.worlds.contacts().reshape(*there.shape, 2).all(axis=2)
+        others_there = there.sum(axis=1, keepdims=True) - there == there.shape[1] - 1
+        counted: BoolArray = there & (~held | others_there)
+        return counted
 
     def _worth(self, there: BoolArray) -> FloatArray:
         """(N,) reward of having (N, K) objects at their goals."""

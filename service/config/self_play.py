@@ -69,11 +69,6 @@ class GameConfig(FrozenModel):
     bob_success_reward: float = Field(
         1.0, gt=0.0, description="when the object comes onto the goal; taken back when it leaves (OpenAI 2021)"
     )
-    bob_lets_go: bool = Field(
-        False,
-        description="in his turn an object whose goal is on the table counts as there only while he does not hold it. "
-        "Of several objects he would hold the first one to the end (decision 48)",
-    )
     bob_margin_m: float = Field(
         0.0,
         ge=0.0,

@@ -29,12 +29,6 @@ def in_air(positions: StateArray, rest_height_m: float) -> BoolArray:
     return lifted
 
 
-def lying(places: StateArray, world: WorldConfig) -> BoolArray:
-    """(M, K) whether objects at (M, 3 K) places are on the table, rather than on another object or in the air."""
-    low: BoolArray = each_object(places)[:, :, 2] <= np.add(world.rest_heights_m, AIR_ABOVE_REST_M / 2)
-    return low
-
-
 def height_bins(positions: StateArray, rest_height_m: float) -> IntArray:
     """(M,) index into ``HEIGHT_NAMES`` of (M, 3) positions; bin 0 is exactly what is not ``in_air``."""
     edges = rest_height_m + np.array([AIR_ABOVE_REST_M, *HEIGHT_EDGES_M])

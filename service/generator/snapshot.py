@@ -13,10 +13,10 @@ from service.base.tensors import join_parts, split_parts
 from service.base.types import Array, Arrays, BoolArray, IntArray, StateArray
 from service.config import WorldConfig
 from service.config.self_play import GOAL_SOURCES, SelfPlayConfig
-from service.envs.observations import distances
+from service.envs.observations import distances, each_object
 from service.envs.sampling import are_apart, inside_obstacles, sample_goals
 from service.envs.state_layout import places_at
-from service.generator.bins import GoalCells, TaskBins, highest, in_air, lying
+from service.generator.bins import AIR_ABOVE_REST_M, GoalCells, TaskBins, highest, in_air
 from service.generator.opponents import RoundPlan
 from service.generator.ring import Rows, join_rows
 from service.generator.sources import NUM_DRAWN, CheckedSource
@@ -243,7 +243,7 @@ def _one_stays(goal: StateArray, start: StateArray, world: WorldConfig, rng: np.
     num = world.num_objects
     moved = rng.integers(2 * num, size=len(goal))
     # What rests on another object does not stay, either.
-    lifted = ~lying(start, world)
+    lifted = each_object(start)[:, :, 2] > np.add(world.rest_heights_m, AIR_ABOVE_REST_M / 2)
     moved = np.where((moved < num) & lifted.any(axis=1), lifted.argmax(axis=1), moved)
     stays = (moved[:, None] < num) & (moved[:, None] != np.arange(num))
     kept = np.where(np.repeat(stays, 3, axis=1), start, goal)

@@ -153,32 +153,6 @@ def test_bobs_turn_ends_once_the_object_was_on_the_goal_for_so_many_steps_in_a_r
     assert rollout.records.num_bob_steps[0] == last + 1
 
 
-class Grasper(Constant):
-    """Goes down to the table, closes the gripper for six steps, and opens it."""
-
-    def act(self, observation, rng):
-        action, log_prob = super().act(observation, rng)
-        step = len(self.seen) - 1
-        action[:, 2], action[:, 3] = (-1.0, 0.0) if step < 4 else (0.0, -1.0 if step < 10 else 1.0)
-        return action, log_prob
-
-
-@pytest.mark.parametrize(("lets_go", "height_m"), [(False, 0.025), (True, 0.025), (True, 0.052)])
-def test_what_lies_on_the_table_is_there_once_it_is_let_go_of(lets_go, height_m):
-    settings = {"bob_lets_go": lets_go, "bob_hold_steps": 20, "bob_steps": 16}
-    game = make_game(make_config(1, game=settings), [Start((-0.05, 0.0, 0.025))])
-    held = []
-    choose = replay_in([0], game.worlds.states[0].copy(), (-0.05, 0.0, height_m))
-    play(game, bob=Grasper(), choose_goals=choose, observe=lambda _: held.append(game.worlds.contacts().all()))
-    held = held[-16:]  # after each step of Bob's
-    begins, ends = held.index(True), held.index(False, held.index(True))
-    assert 4 <= begins < ends < 15
-    again = make_game(make_config(1, game=settings), [Start((-0.05, 0.0, 0.025))])
-    paid = play(again, bob=Grasper(), choose_goals=choose).bob.reward[:, 0]
-    changes = {0: 1.0, begins: -1.0, ends: 1.0} if lets_go and height_m < 0.05 else {0: 1.0}
-    assert {step: reward for step, reward in enumerate(paid.tolist()) if reward} == changes
-
-
 def test_with_a_margin_bob_has_to_come_nearer():
     near = (-0.15, 0.045, 0.025)  # 4.5 cm from the goal
     positions = [OFF_GOAL, near, near, ON_GOAL, near, ON_GOAL, ON_GOAL]

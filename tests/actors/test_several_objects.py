@@ -7,7 +7,7 @@ from service.actors.self_play import SPANNING_SHARE, SelfPlay
 from service.config import parse_config
 from service.envs.observations import distances, each_object
 from service.generator.validity import Verdict
-from tests.actors.players import Chooser, Noise, alices_own, assert_same_rollout, given, make_config, play
+from tests.actors.players import Chooser, Constant, Noise, alices_own, assert_same_rollout, given, make_config, play
 from tests.runs.runs import TREE, assert_same_run
 from tests.runs.runs import play as run
 
@@ -67,6 +67,32 @@ def test_the_turn_ends_when_all_are_held():
     there = distances(path, rollout.records.goal[0]) <= 0.05
     first = int(np.argmax(there.all(axis=1)))
     assert rollout.records.num_bob_steps[0] == first + 1  # it is seen a step before it is paid
+
+
+class Grasper(Constant):
+    """Goes down to the table, closes the gripper for six steps, and opens it."""
+
+    def act(self, observation, rng):
+        action, log_prob = super().act(observation, rng)
+        step = len(self.seen) - 1
+        action[:, 2], action[:, 3] = (-1.0, 0.0) if step < 4 else (0.0, -1.0 if step < 10 else 1.0)
+        return action, log_prob
+
+
+@pytest.mark.parametrize("blue_is_there", [True, False])
+def test_what_is_held_counts_once_all_others_are_there(blue_is_there):
+    under = (-0.05, 0.0, 0.025)
+    choose = given(np.array([*under, *(BLUE if blue_is_there else (0.1, 0.15, 0.025))]))
+    game, held = make_game(places=(under, BLUE), bob_steps=16, bob_hold_steps=20), []
+    rollout = play(
+        game, bob=Grasper(), choose_goals=choose, observe=lambda _: held.append(game.worlds.contacts()[0, :2].all())
+    )
+    held = held[-rollout.records.num_bob_steps[0] :]  # after each step of Bob's
+    begins, ends = held.index(True), held.index(False, held.index(True))
+    assert 4 <= begins < ends < 15
+    paid = rollout.bob.reward[:, 0].tolist()
+    changes = {0: 7.0} if blue_is_there else {begins: -1.0, ends: 1.0}
+    assert {step: reward for step, reward in enumerate(paid) if reward} == changes
 
 
 def test_a_turn_has_time_for_each_object_that_has_to_be_moved():
