@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from benchmarks.report.downstream import BEST, PAPER, Seeds, each_seed, methods_table
-from benchmarks.report.markdown import Row, percent, table
+from benchmarks.report.downstream import BEST, PAPER, Seeds, each_seed, mean_until, methods_table
+from benchmarks.report.markdown import Row, millions, percent, table
 from benchmarks.report.results import TRIAL, Result, by_method_and_task
 from benchmarks.reproduce import MANY_UPDATES, PAPER_PRIMITIVES, Experiment
 from service.actors.evaluation import wilson_interval
@@ -18,6 +18,8 @@ from service.methods.task_methods import METHODS
 
 PAPER_EPISODES = 48
 """Of each of the paper's rates, most likely: nearly all are multiples of 1/48, so 16 episodes of three seeds."""
+GOOD = 0.9
+"""Success of which longer trials say when they reach it."""
 _PAPER_RECIPE = next(iter(PAPER_PRIMITIVES.values())).partition("@")[0]
 _OWN = "ours-her"
 """The composing method of the summary."""
@@ -44,6 +46,7 @@ def comparison_table(results: Sequence[Result], as_paper: Sequence[Result] = ())
 def longer_table(results: Sequence[Result], longer: Sequence[Result], more_updates: Sequence[Result] = ()) -> str:
     """Success after the env steps of the table and after those of longer trials, where there are such, of equal seeds.
 
+    Where each of these seeds was ``GOOD`` in two evaluations in a row, the cell says after how many env steps.
     ``more_updates`` are longer trials with ``MANY_UPDATES`` of the learner for every 64 env steps.
     """
     tasks = [task for task in PAPERS if any(each[TRIAL]["task"] == task for each in (*longer, *more_updates))]
@@ -116,7 +119,11 @@ def _from_to(before: Seeds, after: Seeds) -> str:
     if alike:
         known = {each[TRIAL]["seed"] for each in alike}
         after = [each for each in after if each[TRIAL]["seed"] in known]
-    return f"{_mean(alike)} to {_mean(after)} ({len(after)})" if after else ""
+    if not after:
+        return ""
+    good = mean_until(after, GOOD)
+    when = "" if good is None else f", {percent(GOOD)} after {millions(good)}"
+    return f"{_mean(alike)} to {_mean(after)} ({len(after)}){when}"
 
 
 def _compared(title: str, method: str, of: Mapping[tuple[str, str], list[Result]]) -> Row:

@@ -188,7 +188,7 @@ def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
         for task in PAPERS:
             seeds = of.get((method, task), [])
             level = FINAL_SHARE * float(np.mean([each["evaluation"]["success_last"] for each in seeds] or [0.0]))
-            until = _mean_until(seeds, level)
+            until = mean_until(seeds, level)
             rivals = {name: of[name, task] for name in scratch if (name, task) in of}
             own.append("" if until is None else f"{until / 1e3:.0f}")
             others.append("" if until is None or not rivals else f"*{_soonest(rivals, level)}*")
@@ -202,7 +202,7 @@ def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
     )
 
 
-def _mean_until(seeds: Seeds, level: float) -> float | None:
+def mean_until(seeds: Seeds, level: float) -> float | None:
     """Env steps until a level, mean of the seeds; None: not every seed reaches it."""
     soon = [steps_until(result["curve"], "success_last", level, num_in_a_row=2) for result in seeds]
     return None if not soon or None in soon or not level else float(np.mean(soon))  # type: ignore[arg-type]
@@ -210,7 +210,7 @@ def _mean_until(seeds: Seeds, level: float) -> float | None:
 
 def _soonest(of: Mapping[str, Seeds], level: float) -> str:
     """``128, scratch monolithic + HER (4)``, or ``> 200 (4)`` where no method reaches the level."""
-    found = {name: _mean_until(seeds, level) for name, seeds in of.items()}
+    found = {name: mean_until(seeds, level) for name, seeds in of.items()}
     reached = {name: until for name, until in found.items() if until is not None}
     if not reached:
         longest = max(result["env_steps"] for seeds in of.values() for result in seeds)

@@ -3,7 +3,7 @@
 import pytest
 from PIL import Image
 
-from benchmarks.report.downstream import _mean_until, check_versions, draw_table
+from benchmarks.report.downstream import check_versions, draw_table, mean_until
 from service.base.errors import TandemError
 from service.envs.tasks import find_task
 
@@ -51,7 +51,7 @@ def test_results_of_two_versions_of_what_learns_are_refused():
 
 def test_how_soon_by_hand():
     curve = [{"env_steps": step, "success_last": rate} for step, rate in [(1, 0.9), (2, 0.1), (3, 0.8), (4, 0.9)]]
-    assert _mean_until([{"curve": curve}], 0.5) == 2  # of the two that are good enough on average, the last
-    assert _mean_until([{"curve": curve}], 0.6) == 4
-    assert _mean_until([{"curve": curve}], 0.9) is None
-    assert _mean_until([{"curve": curve}], 0.0) is None
+    assert mean_until([{"curve": curve}], 0.5) == 2  # of the two that are good enough on average, the last
+    assert mean_until([{"curve": curve}], 0.6) == 4
+    assert mean_until([{"curve": curve}], 0.9) is None
+    assert mean_until([{"curve": curve}], 0.0) is None
