@@ -46,7 +46,7 @@ def comparison_table(results: Sequence[Result], as_paper: Sequence[Result] = ())
 def longer_table(results: Sequence[Result], longer: Sequence[Result], more_updates: Sequence[Result] = ()) -> str:
     """Success after the env steps of the table and after those of longer trials, where there are such, of equal seeds.
 
-    Where each of these seeds was ``GOOD`` in two evaluations in a row, the cell says after how many env steps.
+    Where each of these seeds was ``GOOD``, by the mean of two evaluations in a row, the cell says from when on.
     ``more_updates`` are longer trials with ``MANY_UPDATES`` of the learner for every 64 env steps.
     """
     tasks = [task for task in PAPERS if any(each[TRIAL]["task"] == task for each in (*longer, *more_updates))]
