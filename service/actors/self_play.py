@@ -3,14 +3,13 @@
 Alice acts from s0 for a number of steps, fixed or drawn; where the objects then are becomes the goal. The worlds go
 back to s0, and Bob acts until he has held the objects there or his time is over. The next round of the game starts
 where Alice ended, so games reach grasped objects by themselves; an invalid goal ends the game (OpenAI 2021, section 3).
-Some goals may span two rounds: they lead from the start of the round before, as one short turn moves one object.
 Without Alice, a control, Bob plays goals of the task generator, and the next round starts where he ended.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -41,8 +40,6 @@ class StochasticPolicy(Protocol):
         """(N, O) observations to sampled actions (N, A) and log-probabilities (N,)."""
 
 
-SPANNING_SHARE = 0.5
-"""Of the goals that may lead from the start of the round before, so many do."""
 Observer = Callable[[StateArray], None]
 """Called with the (N, S) states at the start of a turn and after each of its steps; it must copy what it keeps."""
 
@@ -56,17 +53,6 @@ class Players:
     bob: StochasticPolicy
     past_alice: Sequence[StochasticPolicy] = ()
     past_bob: Sequence[StochasticPolicy] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class _RoundBefore:
-    """What goals that span two rounds need of the last one."""
-
-    alice: Turns
-    start_state: StateArray
-    """(N, S)."""
-    start_position: StateArray
-    """(N, 3 K)."""
 
 
 class SelfPlay:
@@ -105,9 +91,6 @@ class SelfPlay:
         self.cells = GoalCells(config.world, config.generator.cell_size_m)
         self.reached: IntArray = np.zeros(len(self.cells), dtype=np.int64)
         """(cells,) steps of the last round after which an object was there."""
-        self.proposed_from: StateArray = np.zeros((config.game.num_worlds, 3 * config.world.num_objects))
-        """(N, 3 K) places from which the last round's proposals lead."""
-        self._before: _RoundBefore | None = None
         self.block_grippers(0.0)
         self.worlds.reset(rng)
 
@@ -149,22 +132,14 @@ class SelfPlay:
         end_state, end_position = worlds.states.copy(), worlds.object_position.copy()
         verdict = classify_goal(start_position, end_position, self.config.world.workspace, game.success_distance_m)
         verdict[diverged] = Verdict.FALLEN
-        spanning = self._spanning(end_position, verdict == Verdict.VALID)
-        moved_from = start_position.copy()
-        this_round = _RoundBefore(alice, start_state.copy(), moved_from) if game.goal_rounds > 1 else None
-        if self._before is not None:
-            start_state[spanning] = self._before.start_state[spanning]
-            start_position[spanning] = self._before.start_position[spanning]
-        self.proposed_from = start_position
         proposal = proposed(start_position, end_position, game.success_distance_m)
         choice = snapshot.choose_goals(
             plan,
             start_state,
             start_position,
-            self._round_index - spanning,
+            self._round_index,
             proposal,
             verdict,
-            moved_from=moved_from,
             rng=self._rng,
         )
 
@@ -203,7 +178,7 @@ class SelfPlay:
             policy_version=players.version,
             alice=alice,
             bob=bob,
-            demonstrations=self._demonstrations(alice, bob, records, achieved, spanning),
+            demonstrations=self._demonstrations(alice, bob, records, achieved),
             records=records,
             num_env_steps=(num_env_steps := int(alice.active.sum()) + num_bob_steps),
             metrics=_contact_metrics(contacts) | {"bob/env_steps_fraction": num_bob_steps / max(num_env_steps, 1)},
@@ -211,20 +186,7 @@ class SelfPlay:
         )
         worlds.diverged = []
         self._sequence += 1
-        self._before = this_round
         return rollout
-
-    def _spanning(self, end_position: StateArray, valid: BoolArray) -> BoolArray:
-        """(N,) worlds whose goal leads from the start of the round before."""
-        if self._before is None:
-            return np.zeros(len(valid), dtype=bool)
-        game = self.config.game
-        far = classify_goal(
-            self._before.start_position, end_position, self.config.world.workspace, game.success_distance_m
-        )
-        chosen = self._rng.random(len(valid)) < SPANNING_SHARE
-        spanning: BoolArray = chosen & valid & (far == Verdict.VALID) & (self._round_index > 0)
-        return spanning
 
     def _play_alice(
         self, players: Players, plan: RoundPlan, observe: Observer | None
@@ -351,16 +313,11 @@ class SelfPlay:
         # What a valid goal was worth is unknown where Bob could not try it.
         alice.learn[valid & ~tried] = False
 
-    def _demonstrations(
-        self, alice: Turns, bob: Turns, records: GoalRecords, achieved: StateArray, spanning: BoolArray
-    ) -> Demonstrations:
+    def _demonstrations(self, alice: Turns, bob: Turns, records: GoalRecords, achieved: StateArray) -> Demonstrations:
         """Alice's turns for the goals the current Bob failed; with hindsight, also steps of his own failures."""
         failed = records.played & ~records.solved & ~records.bob_past
         hers = failed & ~records.replayed
         by_alice = self._relabelled(alice, alice.active & hers, records.goal)
-        if self._before is not None:  # of goals that span two rounds, both
-            before = self._relabelled(self._before.alice, self._before.alice.active & hers & spanning, records.goal)
-            by_alice = join_demonstrations([before, by_alice])
         if not self.config.learner.abc.hindsight:
             return by_alice
         config = self.config
@@ -399,10 +356,6 @@ class SelfPlay:
             "sequence": np.array(self._sequence),
             "num_broken": np.array(self.worlds.num_diverged),
         }
-        if self._before is not None:
-            before = self._before
-            own |= {"before_state": before.start_state, "before_position": before.start_position}
-            own |= {f"before_{field.name}": getattr(before.alice, field.name) for field in fields(Turns)}
         return own
 
     def load_state(self, state: Arrays) -> None:
@@ -411,9 +364,6 @@ class SelfPlay:
         self._round_index = np.asarray(state["round_index"], dtype=np.int64).copy()
         self._sequence = int(state["sequence"])
         self.worlds.num_diverged = int(state["num_broken"])
-        if "before_state" in state:
-            alice = Turns(**{field.name: state[f"before_{field.name}"] for field in fields(Turns)})
-            self._before = _RoundBefore(alice, state["before_state"], state["before_position"])
 
 
 def _act(

@@ -18,9 +18,6 @@ class GameConfig(FrozenModel):
     """Asymmetric self-play: who plays how long, for which rewards."""
 
     num_worlds: int = Field(160, ge=1, description="worlds stepped together by one actor")
-    goal_rounds: int = Field(
-        1, ge=1, le=2, description="2: every second goal of a later round leads from the start of the round before"
-    )
     num_goals: int = Field(5, ge=1, description="most rounds from one reset (OpenAI 2021: 5)")
     alice_plays: bool = Field(
         True,

@@ -210,7 +210,6 @@ def summarize(
     records: GoalRecords,
     starts: Rows,
     reached: IntArray,
-    proposed_from: StateArray,
     cells: GoalCells,
     tasks: TaskBins,
     *,
@@ -227,7 +226,6 @@ def summarize(
         records: of the round.
         starts: (N,) of the round, where Alice's turns began.
         reached: (cells,) steps of the round after which an object was there.
-        proposed_from: (N, 3 K) places from which Alice's proposals lead.
         cells: of goals.
         tasks: bins of tasks.
         max_goals: of more new goals for the buffer, so many are drawn at random.
@@ -241,18 +239,17 @@ def summarize(
     if tasks.some_blocked:
         sums |= _blocked_sums(records, tried, tasks.blocked(records.start_state))
     if tasks.world.num_objects > 1:
-        sums |= _sums_by_object(records, tried, proposed_from, tasks)
+        sums |= _sums_by_object(records, tried, starts["start_position"], tasks)
     kept = _some(np.flatnonzero(records.own), max_goals, rng)
     begins: BoolArray = records.round_index == 0
     began = _some(np.flatnonzero(begins), max_starts, rng)
     held = _some(np.flatnonzero(~begins & tasks.held(starts["start_state"])), max_starts, rng)
     valid: BoolArray = records.verdict == Verdict.VALID
-    proposal = records.proposal[valid]
-    arrangements = tasks.arrangements(proposal, proposed_from[valid])
+    proposal, began_at = records.proposal[valid], starts["start_position"][valid]
+    arrangements = tasks.arrangements(proposal, began_at)
     cell = cells.of_moved(records.goal[as_proposed], records.start_position[as_proposed])
     return GoalSummary(
-        # She has not proposed anew where an object lies that she moved in the round before.
-        proposed=cells.count(cells.of_moved(proposal, starts["start_position"][valid])),
+        proposed=cells.count(cells.of_moved(proposal, began_at)),
         arranged=np.bincount(arrangements, minlength=NUM_ARRANGEMENTS)[: cells.num_arrangements],
         reached=reached,
         tries=cells.count(cell),
@@ -292,15 +289,13 @@ def _blocked_sums(records: GoalRecords, tried: BoolArray, blocked: BoolArray) ->
     return sum_up({"alice/valid_fraction_blocked": valid, "bob/success_rate_blocked": records.solved[tried & blocked]})
 
 
-def _sums_by_object(records: GoalRecords, tried: BoolArray, proposed_from: StateArray, tasks: TaskBins) -> Sums:
+def _sums_by_object(records: GoalRecords, tried: BoolArray, began_at: StateArray, tasks: TaskBins) -> Sums:
     """Of several objects: Bob's success at whatever he tried, and Alice's valid goals, by arrangement and object."""
     valid, solved = _valid(records), records.solved[tried]
     goal, start = records.goal[tried], records.start_position[tried]
     asked, moved = tasks.arrangements(goal, start), distances(goal, start).argmax(axis=1)
-    shown, place = (
-        tasks.arrangements(records.proposal[valid], proposed_from[valid]),
-        each_object(records.proposal[valid]),
-    )
+    proposal = records.proposal[valid]
+    shown, place = tasks.arrangements(proposal, began_at[valid]), each_object(proposal)
     cases: dict[str, Array] = {}
     for kind, name in enumerate(ARRANGEMENT_NAMES):
         cases |= {f"bob/success_rate_{name}": solved[asked == kind], f"alice/{name}_fraction": shown == kind}

@@ -108,7 +108,6 @@ class GeneratorSnapshot:
         proposal: StateArray,
         verdict: NDArray[np.int8],
         *,
-        moved_from: StateArray,
         rng: np.random.Generator,
     ) -> GoalChoice:
         """Choose what Bob plays: Alice's valid goals, or others where the configuration says so.
@@ -124,8 +123,6 @@ class GeneratorSnapshot:
             round_index: (N,) 0 where it is the start of a game.
             proposal: (N, 3 K) positions at the end of Alice's turn, metres; those of a start of what she did not move.
             verdict: (N,) ``Verdict`` of the proposal.
-            moved_from: (N, 3 K) positions of the objects when Alice's turns began, metres. It is another one than
-                ``start_position`` where her goal leads from the start of the round before.
             rng: source of the choice.
         """
         valid: BoolArray = verdict == Verdict.VALID
@@ -136,7 +133,7 @@ class GeneratorSnapshot:
         starts = start_state.copy(), start_position.copy()
         from_reset = (round_index == 0) & ~replayed
         novelty = np.zeros(len(proposal))
-        novelty[valid] = self._novelty(proposal[valid], start_position[valid], moved_from[valid])
+        novelty[valid] = self._novelty(proposal[valid], start_position[valid])
         choice = GoalChoice(proposal.copy(), *starts, replayed, from_reset, valid | replayed, novelty)
         if tasks is not None and replayed.any():
             tasks.give(choice, np.flatnonzero(replayed), rng)
@@ -152,9 +149,9 @@ class GeneratorSnapshot:
         near: BoolArray = np.all(self.near_reached[self.cells.index(goal)], axis=1)
         return near
 
-    def _novelty(self, proposal: StateArray, start: StateArray, moved_from: StateArray) -> StateArray:
-        """(M,) novelty of (M, 3 K) proposals from (M, 3 K) starts, which Alice's last turn led to from others."""
-        novelty: StateArray = self.novelty[self.cells.of_moved(proposal, moved_from)]
+    def _novelty(self, proposal: StateArray, start: StateArray) -> StateArray:
+        """(M,) novelty of (M, 3 K) proposals from (M, 3 K) starts."""
+        novelty: StateArray = self.novelty[self.cells.of_moved(proposal, start)]
         if not self.novelty_of_arrangements.size:
             return novelty
         return np.maximum(novelty, self.novelty_of_arrangements[self.tasks.arrangements(proposal, start)])

@@ -90,7 +90,6 @@ class RolloutWorker:
             rollout.records,
             starts,
             self.game.reached,
-            self.game.proposed_from,
             self.game.cells,
             self._tasks,
             max_goals=-(-config.replay_buffer_size // num_rounds),

@@ -1,6 +1,7 @@
 """Scripted players, and starts whose outcome is known: an object that slides, falls off the table or stays."""
 
 from dataclasses import dataclass, fields
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -116,22 +117,11 @@ def given(goal, own=()):
     return choose
 
 
-class Chooser:
-    """A snapshot whose choice is a function of the round alone; it keeps from where Alice was said to have moved."""
-
-    def __init__(self, choose):
-        self.choose = choose
-
-    def choose_goals(self, plan, *played, moved_from, rng):
-        self.moved_from = moved_from
-        return self.choose(*played)
-
-
 def play(game, alice=None, bob=None, *, plan=None, choose_goals=alices_own, version=0, observe=None, **past):
     """One round; players who are not given do nothing."""
     players = Players(version, alice or Constant(), bob or Constant(), **past)
     plan = plan or everyone_current(game.worlds.num_worlds)
-    chooser = choose_goals if isinstance(choose_goals, Chooser) else Chooser(choose_goals)
+    chooser = SimpleNamespace(choose_goals=lambda plan, *played, rng: choose_goals(*played))
     return game.play_round(players, plan, chooser, observe=observe)
 
 

@@ -1,13 +1,13 @@
-"""The game with two cubes: what is paid, goals that span two rounds, and runs that go on bit for bit."""
+"""The game with two cubes: what is paid, and runs that go on bit for bit."""
 
 import numpy as np
 import pytest
 
-from service.actors.self_play import SPANNING_SHARE, SelfPlay
+from service.actors.self_play import SelfPlay
 from service.config import parse_config
 from service.envs.observations import distances, each_object
 from service.generator.validity import Verdict
-from tests.actors.players import Chooser, Constant, Noise, alices_own, assert_same_rollout, given, make_config, play
+from tests.actors.players import Constant, Noise, alices_own, assert_same_rollout, given, make_config, play
 from tests.runs.runs import TREE, assert_same_run
 from tests.runs.runs import play as run
 
@@ -126,44 +126,9 @@ def test_cells_count_where_each_object_was():
     assert game.reached[:half].sum() == game.reached[half:].sum() == 9
 
 
-def test_goals_that_span_two_rounds_lead_from_the_start_of_the_round_before():
-    num = 40
-    game = make_game(num, goal_rounds=2, num_goals=3)
-    slides(game, "object", 1.2)  # 7 cm in the first round
-    first = play(game)
-    assert (first.records.verdict == Verdict.VALID).all()
-    np.testing.assert_allclose(first.records.start_position, np.tile([*RED, *BLUE], (num, 1)))
-    slides(game, "object_2", 1.2)  # and the other in the second
-    began, chooser = game.worlds.object_position.copy(), Chooser(alices_own)
-    second = play(game, choose_goals=chooser)
-    np.testing.assert_array_equal(chooser.moved_from, began)
-    from_before = distances(second.records.start_position, first.records.start_position).max(axis=1) == 0.0
-    assert abs(from_before.mean() - SPANNING_SHARE) < 0.25
-    moved = distances(second.records.goal, second.records.start_position) > 0.05
-    assert moved[from_before].all()
-    assert (moved[~from_before] == [False, True]).all()
-    steps = 9 * num  # of Alice's turns, all of which Bob failed
-    failed = ~second.records.solved
-    assert failed[from_before].all()
-    assert len(second.demonstrations.action) == steps // num * int(failed.sum() + from_before.sum())
-    one_round = make_game(num, goal_rounds=1, num_goals=3)
-    slides(one_round, "object", 1.2)
-    ends = play(one_round).records.proposal
-    slides(one_round, "object_2", 1.2)
-    np.testing.assert_allclose(play(one_round).records.start_position, ends, atol=5e-3)
-
-
-def test_a_game_that_ended_is_not_spanned():
-    game = make_game(20, goal_rounds=2)
-    play(game)  # nothing moves: every goal is invalid, and games begin anew
-    starts = game.worlds.object_position.copy()
-    slides(game, "object", 1.2)
-    np.testing.assert_array_equal(play(game).records.start_position, starts)
-
-
 def test_a_game_goes_on_where_its_state_was_taken():
     def both():
-        return make_game(6, seed=1, places=None, goal_rounds=2, num_goals=5)
+        return make_game(6, seed=1, places=None, num_goals=5)
 
     game, later = both(), both()
     play(game, Noise(), Noise())
@@ -192,7 +157,7 @@ def test_hindsight_leaves_out_steps_after_which_nothing_moves():
 
 @pytest.fixture(scope="module")
 def config():
-    game = TREE["game"] | {"goal_rounds": 2, "bob_all_reward": 5.0}
+    game = TREE["game"] | {"bob_all_reward": 5.0}
     world = TREE["world"] | {"objects": ["cube", "cube"], "object_size_m": 0.04}
     world |= {"workspace": {"length_x_m": 0.3, "length_y_m": 0.3}}
     run = TREE["run"] | {"total_env_steps": 800, "evaluation_interval": 2, "evaluation_episodes": 3}

@@ -85,8 +85,7 @@ def summary_of(
     starts = starts or {"start_state": records.start_state, "start_position": records.start_position}
     most = {"max_goals": 10**6, "max_starts": 10**6} | limits
     reached = cells.count(cells.index(records.proposal[records.verdict == Verdict.VALID]))
-    came_from = starts["start_position"]
-    return summarize(records, starts, reached, came_from, cells, tasks, rng=np.random.default_rng(0), **most)
+    return summarize(records, starts, reached, cells, tasks, rng=np.random.default_rng(0), **most)
 
 
 def record(generator: TaskGenerator, records: GoalRecords, starts: Rows | None = None) -> Metrics:

@@ -81,7 +81,6 @@ def choose(
         np.arange(num),
         np.tile([-0.1, 0.0, 0.1], (num, 1)),
         np.array(verdict, dtype=np.int8),
-        moved_from=np.tile([0.0, 0.0, 0.025], (num, 1)),
         rng=np.random.default_rng(seed),
     )
 
@@ -351,7 +350,7 @@ def test_no_drawn_goal_in_the_air_where_the_gripper_is_blocked() -> None:
     index, verdict = np.zeros(400, dtype=np.int64), np.full(400, OUTSIDE, dtype=np.int8)
     place = np.tile([0.0, 0.0, 0.025], (400, 1))
     rng = np.random.default_rng(0)
-    choice = snapshot.choose_goals(all_current(400), state, place, index, place, verdict, moved_from=place, rng=rng)
+    choice = snapshot.choose_goals(all_current(400), state, place, index, place, verdict, rng=rng)
     blocked = choice.start_state[:, BLOCKED] == 1.0
     assert 0.1 < blocked.mean() < 0.5
     assert (choice.goal[~blocked, 2] > 0.1).any()
@@ -364,7 +363,7 @@ def test_choice_does_not_alias_its_inputs() -> None:
     verdict = np.zeros(1, dtype=np.int8)
     index = np.zeros(1, dtype=np.int64)
     given = (start_state, position, index, position, verdict)
-    generator.snapshot().choose_goals(all_current(1), *given, moved_from=position, rng=np.random.default_rng(0))
+    generator.snapshot().choose_goals(all_current(1), *given, rng=np.random.default_rng(0))
     assert start_state.tolist() == make_states(1, mark=WORLD).tolist()
     assert position.tolist() == [[0.0] * 3]
 
@@ -504,7 +503,7 @@ def play(generator: TaskGenerator, rng: np.random.Generator, iterations: range) 
         verdict = rng.choice([VALID, OUTSIDE], size=num, p=[0.7, 0.3]).astype(np.int8)
         index = rng.integers(3, size=num)
         given = (start_state, start, index, proposal, verdict)
-        choice = generator.snapshot().choose_goals(plan, *given, moved_from=start, rng=rng)
+        choice = generator.snapshot().choose_goals(plan, *given, rng=rng)
         records = make_records(
             proposal,
             **{name: getattr(choice, name) for name in GoalChoice.__slots__ if name != "novelty"},

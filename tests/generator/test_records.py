@@ -326,7 +326,7 @@ def test_random_numbers_are_left_alone_where_nothing_is_left_out(
     rng, same = np.random.default_rng(3), np.random.default_rng(3)
     reached = CELLS.count(CELLS.index(records.proposal))
     limits = {"max_goals": max_goals, "max_starts": max_starts}
-    summarize(records, starts, reached, starts["start_position"], CELLS, TASKS, **limits, rng=rng)
+    summarize(records, starts, reached, CELLS, TASKS, **limits, rng=rng)
     assert (rng.bit_generator.state == same.bit_generator.state) is untouched
 
 

@@ -151,7 +151,7 @@ def test_goals_in_cells_that_both_have_reached_and_every_second_for_one_object(s
         where="test",
     )
     snapshot = replace(snapshot, config=playing)
-    choice = snapshot.choose_goals(*given, moved_from=places, rng=np.random.default_rng(1))
+    choice = snapshot.choose_goals(*given, rng=np.random.default_rng(1))
     assert choice.played.all()
     assert choice.replayed.all()
     assert are_apart(choice.goal, WORLD).all()
@@ -222,31 +222,32 @@ def test_goals_from_the_start_of_a_game_have_nothing_of_where_other_worlds_are(s
     assert 0.3 < stays[1][num:].mean() < 0.6
 
 
-RED_FIRST = moved((0.0, 0.15, 0.0))
-"""Where her last turn began, of a goal that leads from ``START``: in the round before she had moved red."""
-THEN_BLUE = moved((0.0, 0.15, 0.0), (0.0, 0.1, 0.0))
+BLUE_MOVED = moved(second=(0.0, 0.1, 0.0))
 
 
-def test_a_goal_of_two_rounds_is_as_new_as_what_she_moved_last(snapshot):
+def test_a_goal_is_as_new_as_its_cell_or_its_arrangement(snapshot):
     cells = snapshot.cells
-    blue = cells.index(THEN_BLUE[None])[0, 1]
+    blue = cells.index(BLUE_MOVED[None])[0, 1]
     rare = replace(snapshot, novelty=np.where(np.arange(len(cells)) == blue, 0.75, 0.25), novelty_of_arrangements=None)
-    for arranged, asked in (([0.0, 0.5, 0.0], 0.75), ([0.0, 1.0, 0.0], 1.0), ([1.0, 0.0, 1.0], 0.75)):
-        rare = replace(rare, novelty_of_arrangements=np.array(arranged))  # of several that moved: from the first start
-        given = (np.zeros((1, LAYOUT.size)), START[None], np.zeros(1), THEN_BLUE[None], np.array([Verdict.VALID]))
+    for arranged, asked in (([0.5, 0.0, 0.0], 0.75), ([1.0, 0.0, 0.0], 1.0), ([0.0, 1.0, 1.0], 0.75)):
+        rare = replace(rare, novelty_of_arrangements=np.array(arranged))  # of one that moved, several, a stack
+        given = (np.zeros((1, LAYOUT.size)), START[None], np.zeros(1), BLUE_MOVED[None], np.array([Verdict.VALID]))
         plan = RoundPlan(np.array([CURRENT]), np.array([CURRENT]))
-        choice = rare.choose_goals(plan, *given, moved_from=RED_FIRST[None], rng=np.random.default_rng(0))
+        choice = rare.choose_goals(plan, *given, rng=np.random.default_rng(0))
         assert choice.novelty.tolist() == [asked]
 
 
-def test_a_goal_of_two_rounds_counts_where_she_moved_an_object_last():
-    records = make_records(THEN_BLUE[None], start_position=START[None], start_state=np.zeros((1, LAYOUT.size)))
-    starts = {"start_state": records.start_state, "start_position": RED_FIRST[None]}
+def test_a_proposal_counts_by_where_her_turn_began():
+    """Bob plays another goal there, from another start."""
+    records = make_records(
+        BLUE_MOVED[None], start_position=moved((0.0, 0.15, 0.0))[None], start_state=np.zeros((1, LAYOUT.size))
+    )
+    starts = {"start_state": records.start_state, "start_position": START[None]}
     cells, tasks = GoalCells(WORLD, 0.05), TaskBins(CONFIG, LAYOUT)
     nowhere, most = np.zeros(len(cells), dtype=np.int64), {"max_goals": 9, "max_starts": 9}
-    summary = summarize(records, starts, nowhere, START[None], cells, tasks, **most, rng=np.random.default_rng(0))
-    assert np.flatnonzero(summary.proposed).tolist() == [cells.index(THEN_BLUE[None])[0, 1]]
-    assert summary.arranged.tolist() == [0, 1, 0]
+    summary = summarize(records, starts, nowhere, cells, tasks, **most, rng=np.random.default_rng(0))
+    assert np.flatnonzero(summary.proposed).tolist() == [cells.index(BLUE_MOVED[None])[0, 1]]
+    assert summary.arranged.tolist() == [1, 0, 0]
 
 
 def test_a_stack_is_as_rare_when_she_has_been_everywhere():

@@ -28,7 +28,7 @@ SHORT = ["run.total_env_steps=400", "run.evaluation_interval=1000", "run.final_e
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     root = tmp_path_factory.mktemp("two")
-    file = write_yaml(root / "two.yaml", TREE | {"world": WORLD, "game": TREE["game"] | {"goal_rounds": 2}})
+    file = write_yaml(root / "two.yaml", TREE | {"world": WORLD})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("service.runs.train.make_artifacts", lambda *arguments: {})  # a video takes long
         service.train(str(file), SHORT, run_dir=root / "run", registry=root / "registry", publish=True)
