@@ -23,7 +23,7 @@ uv_flags    = $(addprefix --default-index ,$(index_url)) \
 
 help:
 	@echo "make demo    a short pre-training from scratch: about five minutes, ends with what Bob has learned"
-	@echo "make test    ruff, mypy and every test: about five minutes, ends with how many passed"
+	@echo "make test    ruff, mypy and every test: about ten minutes, ends with how many passed"
 	@echo "make setup   make $(VENV) and install everything into it: about two minutes, 2.9 GB; the others do it first"
 	@echo "make check   ruff, mypy and the tests that are not slow: about a minute"
 	@echo "make docs    the docs site, into build/docs-site/site"

@@ -52,12 +52,13 @@ PAGES = {
     "scaling.md": ("box", "model"),
     "hardware.md": ("demo",),
     "own_task.md": ("learned",),
+    "objects.md": ("two",),
 }
 """Blocks of every page that are made anew."""
 ABOUT_THE_RECIPE = ("results/pretraining.md", "scaling.md")
 """Pages that show it, and so may call it the shipped recipe only while it is."""
-SEEDS = "panda-cube"
-"""Name of the recorded seeds of the recipe."""
+SEEDS, TWO = "panda-cube", "panda-two-cubes"
+"""Names of the recorded seeds of the recipe, and of the one for two objects."""
 Results = Mapping[str, Mapping[str, Any]]
 """Recorded files by the name of their benchmark."""
 Blocks = dict[str, list[str]]
@@ -128,6 +129,7 @@ class Report:
                 "seeds": ["\n".join(filter(None, judged))],
             },
             "own_task.md": {"learned": [measured.own_task_table(read_all(self._results / "own_task"))]},
+            "objects.md": {"two": [pretraining.other_seeds(TWO, seeds[TWO])] if TWO in seeds else []},
             "scaling.md": {
                 "box": [scaling.box_block(found["scaling_box"])],
                 "model": [scaling.model_block(found["scaling_box"], found["time_to_skill"])],
@@ -161,7 +163,9 @@ class Report:
         return {
             "skill": [text(found["time_to_skill"]) for text in (recipe.recipe_words, time_to_skill.report)],
             "seeds": [text(seeds[SEEDS]) for text in (recipe.recipe_words, pretraining.seeds_block) if SEEDS in seeds],
-            "others": [pretraining.other_seeds(name, study) for name, study in seeds.items() if name != SEEDS],
+            "others": [
+                pretraining.other_seeds(name, study) for name, study in seeds.items() if name not in (SEEDS, TWO)
+            ],
             "why": [pretraining.why_alice_table(why)],
             "champion": [pretraining.champion_words(seeds[SEEDS])],
             "tasks": [pretraining.tasks_table(runs)],

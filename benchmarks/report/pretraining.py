@@ -22,6 +22,8 @@ NUM_BINS = 10
 CHAMPION = "panda-cube@champion"
 WHY_KINDS = ("mixed", "table", "air")
 """Goals by which arms are judged."""
+ASKED_OF_SEVERAL = {"one": 0.93, "table": 0.80, "air": 0.60}
+"""Success at the last step that we ask of a Bob with two objects."""
 DIPS_FROM = 4e6
 """Env steps from which on two evaluations in a row below what is asked for are a dip."""
 DIGITS = 12
@@ -83,23 +85,33 @@ def seeds_block(study: Mapping[str, Any]) -> str:
     at = sorted({row["asked"] for run in study["runs"] for row in run["measured"]})
     kinds = [kind for kind in KINDS if kind in study["runs"][0]["measured"][0]]
     names = ", ".join("*Larger*" if kind == "larger" else kind for kind in kinds)
-    head = ("seed", *(f"{millions(asked)}: {names}" for asked in at), "dips", "Alice lifts")
+    judged = {} if "one" in kinds else {"dips": dips}
+    head = ("seed", *(f"{millions(asked)}: {names}" for asked in at), *judged, "Alice lifts")
     rows = []
     for run in study["runs"]:
         found = {row["asked"]: row for row in run["measured"]}
         cells = [", ".join(f"{100 * found[a][kind]['last']:.1f}" for kind in kinds) if a in found else "" for a in at]
         lifts = [point["lifted"] for point in run["curve"][-NUM_LAST:]]
-        rows.append((str(run["seed"]), *cells, dips(run["curve"]), percent(fmean(lifts))))
-    words = f"At least {percent(ASKED_RATES['mixed'])} of mixed goals: {_how_many(study)} env steps."
-    return f"{table(head, rows)}\n\n{words}"
+        rows.append(
+            (str(run["seed"]), *cells, *(judge(run["curve"]) for judge in judged.values()), percent(fmean(lifts)))
+        )
+    rates = ", ".join(f"{percent(rate)} of {kind}" for kind, rate in _asked(study).items())
+    return f"{table(head, rows)}\n\nAt least {rates} goals: {_how_many(study)} env steps."
+
+
+def _asked(study: Mapping[str, Any]) -> dict[str, float]:
+    """Rates that are asked of its runs, by the kind of goals."""
+    several = "one" in study["runs"][0]["measured"][0]
+    return ASKED_OF_SEVERAL if several else {"mixed": ASKED_RATES["mixed"]}
 
 
 def _how_many(study: Mapping[str, Any]) -> str:
-    """How many runs solve what is asked of mixed goals, at each number of env steps."""
-    counts = []
+    """How many runs solve what is asked, at each number of env steps."""
+    counts, rates = [], _asked(study)
     for asked in sorted({row["asked"] for run in study["runs"] for row in run["measured"]}):
-        rates = [row["mixed"]["last"] for run in study["runs"] for row in run["measured"] if row["asked"] == asked]
-        counts.append(f"{sum(rate >= ASKED_RATES['mixed'] for rate in rates)} of {len(rates)} at {millions(asked)}")
+        rows = [row for run in study["runs"] for row in run["measured"] if row["asked"] == asked]
+        enough = sum(all(row[kind]["last"] >= rate for kind, rate in rates.items()) for row in rows)
+        counts.append(f"{enough} of {len(rows)} at {millions(asked)}")
     return ", ".join(counts)
 
 
