@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from contextlib import ExitStack, closing, contextmanager
+from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,6 +71,9 @@ TREE = {
     },
 }
 
+PROCESSES = get_context("forkserver")
+"""Begins other processes by forking one that has torch, and no threads of Ray's; each would take 2 s to import it."""
+PROCESSES.set_forkserver_preload(["service.learner.learner"])
 TINY_TASK = [
     *("--set", "sac.num_worlds=4", "--set", "sac.learning_starts=200", "--set", "sac.hidden_sizes=[8]"),
     *("--set", "sac.batch_size=8", "--set", "sac.gradient_steps=1", "--set", "run.final_episodes=4"),

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from multiprocessing import get_context
 
 import pytest
 
@@ -16,7 +15,7 @@ from service.base.jsonl import JsonlWriter
 from service.runs.resuming import resumed_config
 from service.store.checkpoints import CheckpointStore
 from service.store.run_directory import RunDirectory
-from tests.runs.runs import ROOT, assert_same_run, newest, play, start_endless_run, tiny_config
+from tests.runs.runs import PROCESSES, ROOT, assert_same_run, newest, play, start_endless_run, tiny_config
 
 STEP = 4
 """The checkpoint that is killed, of those after every second iteration."""
@@ -27,8 +26,8 @@ def die():
 
 
 def killed(moment, path, *, resume=False):
-    """Let another process play until it dies of the moment. It is no fork: this one may have threads of Ray's."""
-    process = get_context("spawn").Process(target=_play_until, args=(moment, path, resume))
+    """Let another process play until it dies of the moment."""
+    process = PROCESSES.Process(target=_play_until, args=(moment, path, resume))
     process.start()
     process.join(600)
     assert process.exitcode == -signal.SIGKILL

@@ -5,7 +5,6 @@ import math
 import signal
 import threading
 import time
-from multiprocessing import get_context
 
 import httpx
 import numpy as np
@@ -29,6 +28,7 @@ from service.store.redis_reader import RedisReader
 from service.store.run_directory import RunDirectory
 from service.store.run_writer import RunWriter
 from tests.runs.runs import (
+    PROCESSES,
     assert_one_line,
     assert_same_run,
     play,
@@ -226,7 +226,7 @@ def test_a_run_that_another_took_over_stops_at_once_and_leaves_its_status_alone(
 
 def test_a_second_process_is_refused_and_a_killed_one_has_vanished(tmp_path):
     path, reader = tmp_path / "runs" / "cube", DiskReader(tmp_path / "runs")
-    other = get_context("spawn").Process(target=run, args=(tmp_path, tiny_config(total_env_steps=10**9)))
+    other = PROCESSES.Process(target=run, args=(tmp_path, tiny_config(total_env_steps=10**9)))
     other.start()
     try:
         wait_until(lambda: path.exists() and reader.runs() and reader.run("cube").iteration > 0, within_s=600.0)
