@@ -203,7 +203,9 @@ class Report:
             "missing": [comparison.missing_table(list(experiments(self._results / RESULTS.name)))],
         }
         if longer:  # none was recorded yet
-            picture = self.show("Success over more env steps", "downstream-longer", draw_table, longer)
+            picture = self.show(
+                "Success over more env steps, with 8 updates for 64", "downstream-longer", draw_table, longer
+            )
             blocks["longer"] = [comparison.longer_table(trials, longer, more_updates), picture]
         return blocks
 
