@@ -3,8 +3,8 @@
     python -m benchmarks.reproduce --list
     python -m benchmarks.reproduce --parallel 2
 
-That is the table of downstream tasks and skill discovery, some sixty hours of one core, by today's version of what
-learns.
+That is the table of downstream tasks, skill discovery and tasks of two cubes, some seventy hours of one core, by
+today's version of what learns.
 Each is one or more of the commands that anybody can type, and this prints them. What was stopped goes on from its run
 directory. Pictures and pages are made from the files afterwards, by ``python -m benchmarks.report``.
 """
@@ -23,17 +23,20 @@ from pathlib import Path
 
 from benchmarks.measuring import ROOT
 from service.base.version import LEARNING_VERSION
-from service.envs.tasks import PAPERS, find_task
+from service.envs.tasks import PAPERS
 from service.methods.task_methods import METHODS
 
 PRIMITIVES = {0: "panda-cube@seed-30", 1: "panda-cube@seed-31", 2: "panda-cube@seed-32"}
 """Versions in ``primitives`` by the seed of the trials that take them: each has its own pre-training."""
 PAPER_PRIMITIVES = {seed: f"panda-cube-paper@seed-{10 + seed}" for seed in PRIMITIVES}
 """The same, of the recipe as the paper has it."""
+TWO_CUBES_PRIMITIVES = {0: "panda-two-cubes@seed-30", 1: "panda-two-cubes@seed-31"}
+TWO_CUBES = tuple(f"docs/examples/two_cubes.py:{name}" for name in ("STACK", "UNSTACK", "SORT", "CLEAR"))
+"""Tasks of two cubes."""
 NETWORKS = ("monolithic", "mcp")
 SKILL_METHODS = ("lsd", "metra", "dads", "diayn")
 SKILL_ENV_STEPS = 4_000_000
-LONGER_ENV_STEPS = 1_000_000
+LONGER_ENV_STEPS, TWO_CUBES_ENV_STEPS = 1_000_000, 500_000
 MANY_UPDATES = 32
 """For 64 env steps, instead of 8."""
 RESULTS, RUNS = ROOT / "docs" / "results" / f"v{LEARNING_VERSION}", ROOT / "runs" / "reproduce"
@@ -70,6 +73,9 @@ def experiments(out: Path = RESULTS) -> Iterator[Experiment]:
     for task in ("inair", "sphere", "push"):
         yield from (_longer(out, task, f"scratch-{net}-her") for net in NETWORKS)
         yield _longer(out, task, "scratch-monolithic-her", MANY_UPDATES)
+    for seed, reference in TWO_CUBES_PRIMITIVES.items():
+        for method in ("ours-her", "asp-only", "scratch-monolithic-her"):
+            yield from (_two_cubes(out, task, method, seed, reference) for task in TWO_CUBES)
     yield from (each for seed in PRIMITIVES for each in _skills(out, seed))
     yield from _from_scratch(out, "")
     for seed, reference in PAPER_PRIMITIVES.items():
@@ -79,7 +85,7 @@ def experiments(out: Path = RESULTS) -> Iterator[Experiment]:
                 yield replace(found, group=f"{found.group}, as the paper pre-trains")
     for seed in (0, 1):
         for method in ("ours-her", "ours", "scratch-monolithic-her", "scratch-monolithic"):
-            yield _trial(out, "hard-push", method, seed)
+            yield replace(_trial(out, "hard-push", method, seed), group="HardPush", part=method)
 
 
 def _from_scratch(out: Path, her: str) -> Iterator[Experiment]:
@@ -101,19 +107,30 @@ def _longer(out: Path, task: str, method: str, updates: int | None = None) -> Ex
     return replace(found, group=group, part=f"{task}-{method}")
 
 
+def _two_cubes(out: Path, task: str, method: str, seed: int, reference: str) -> Experiment:
+    extra = ("--set", f"run.total_env_steps={TWO_CUBES_ENV_STEPS}")
+    found = _table(out, "two_cubes", task, method, seed, reference, extra)
+    return replace(found, group="tasks of two cubes", part=f"{_name(task)}-{method}")
+
+
+def _name(task: str) -> str:
+    """A task in names of files: those of a Python file are called ``FILE:NAME``."""
+    return task.rpartition(":")[2].lower()
+
+
 def _table(
     out: Path, directory: str, task: str, method: str, seed: int, reference: str, extra: Command = ()
 ) -> Experiment:
     """A trial with primitives or skills of the recorded registry."""
-    name, file = f"{directory}/{task}-{method}-{seed}", out / directory / f"{task}-{method}-{seed}.json"
+    name = f"{directory}/{_name(task)}-{method}-{seed}"
+    file = out / f"{name}.json"
     command = _python(
         *("benchmarks.trials", task, method, str(seed), "--primitives", reference, "--out", str(file)),
         *("--registry", str(out / "primitives"), "--runs", str(RUNS / directory)),
         *("--set", "run.num_threads=1", *extra),
     )
     versions = out / "primitives" / "models" / reference.partition("@")[0]
-    group, part = (METHODS[method].title, task) if task in PAPERS else (find_task(task).title, method)
-    return Experiment(name, file, group, part, seed, (command,), versions)
+    return Experiment(name, file, METHODS[method].title, task, seed, (command,), versions)
 
 
 def _skills(out: Path, seed: int) -> Iterator[Experiment]:

@@ -18,9 +18,9 @@ from typing import Any
 from benchmarks import scaling, time_to_skill, transfer
 from benchmarks.measuring import one_line_errors
 from benchmarks.report import comparison, figures, measured, pretraining, recipe, skills
-from benchmarks.report.downstream import draw_table, write_results
-from benchmarks.report.results import Result, read_all
-from benchmarks.reproduce import MANY_UPDATES, RESULTS, experiments
+from benchmarks.report.downstream import draw_table, each_seed, methods_table, write_results
+from benchmarks.report.results import Result, by_method_and_task, read_all
+from benchmarks.reproduce import MANY_UPDATES, RESULTS, TWO_CUBES, experiments
 from benchmarks.run_files import Run
 from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
@@ -52,7 +52,7 @@ PAGES = {
     "scaling.md": ("box", "model"),
     "hardware.md": ("demo",),
     "own_task.md": ("learned",),
-    "objects.md": ("two",),
+    "objects.md": ("two", "tasks"),
 }
 """Blocks of every page that are made anew."""
 ABOUT_THE_RECIPE = ("results/pretraining.md", "scaling.md")
@@ -105,7 +105,9 @@ class Report:
         """Write all pages and pictures."""
         found = read_all(self._results, FILES)
         runs = [run for run in read_all(self._results / "runs").values() if "ablation" not in run]
-        trials = list(read_all(self._results / RESULTS.name / "downstream").values())
+        todays = self._results / RESULTS.name
+        trials = list(read_all(todays / "downstream").values())
+        two_cubes = by_method_and_task(list(read_all(todays / "two_cubes").values()))
         # of version 1 until those of today's are whole
         recorded_skills = list(read_all(self._results / "skills").values())
         for page, names in PAGES.items():  # what is wrong with a page is found before anything is drawn
@@ -129,7 +131,10 @@ class Report:
                 "seeds": ["\n".join(filter(None, judged))],
             },
             "own_task.md": {"learned": [measured.own_task_table(read_all(self._results / "own_task"))]},
-            "objects.md": {"two": [pretraining.other_seeds(TWO, seeds[TWO])] if TWO in seeds else []},
+            "objects.md": {
+                "two": [pretraining.other_seeds(TWO, seeds[TWO])] if TWO in seeds else [],
+                "tasks": [methods_table(two_cubes, each_seed, tasks=TWO_CUBES)] if two_cubes else [],
+            },
             "scaling.md": {
                 "box": [scaling.box_block(found["scaling_box"])],
                 "model": [scaling.model_block(found["scaling_box"], found["time_to_skill"])],
