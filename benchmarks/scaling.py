@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.measuring import run_benchmark
-from benchmarks.report.markdown import commit, percent, table
+from benchmarks.report.markdown import commit, millions, percent, table
 from benchmarks.training_process import ENDLESS, PLAIN, Measured, measure_copy, overrides, scratch
 from service.config.self_play import SelfPlayConfig
 from service.store.run_directory import RunDirectory
@@ -149,16 +149,33 @@ def model_block(result: Mapping[str, Any], skill: Mapping[str, Any]) -> str:
         result: one box, as ``scaling_box.json`` has it.
         skill: times to a skill, as ``benchmarks.time_to_skill`` writes them.
     """
-    costs = Costs.of(result["one_box"])
     num_updates = statistics.median(run["at"]["iteration"] if run["reached"] else math.inf for run in skill["runs"])
+    return _model_of(Costs.of(result["one_box"]), num_updates, "the skill")
+
+
+def recipe_block(result: Mapping[str, Any], env_steps: int) -> str:
+    """Minutes to the end of a recipe on more cores, in Markdown, for ``docs/scaling.md``.
+
+    Args:
+        result: one box, with a run of the recipe.
+        env_steps: of the whole recipe.
+    """
+    one = result["one_box"]["1"]
+    num_updates = env_steps / (one["env_steps_per_s"] * one["iteration_s"])
+    return _model_of(Costs.of(result["one_box"]), num_updates, f"{millions(env_steps)} env steps")
+
+
+def _model_of(costs: Costs, num_updates: float, goal: str) -> str:
+    """What the model says of so many updates, and a table of minutes to the ``goal``."""
     rows = []
     for cores in CORES:
         update_s = costs.update_s(cores - 1)
         minutes = num_updates * update_s / 60.0
         busy = costs.learner_s / update_s
         seeds = cores // 2 * 60.0 / (num_updates * costs.update_s(1) / 60.0)
-        rows.append((str(cores), f"{update_s:.2f} s", f"{minutes:.1f}", percent(busy), f"{seeds:.0f}"))
-    head = ("cores", "an update every", "minutes to the skill", "learner busy", "or seeds an hour, two cores each")
+        an_hour = f"{seeds:.0f}" if seeds >= 10.0 else f"{seeds:.1f}"
+        rows.append((str(cores), f"{update_s:.2f} s", f"{minutes:.1f}", percent(busy), an_hour))
+    head = ("cores", "an update every", f"minutes to {goal}", "learner busy", "or seeds an hour, two cores each")
     return (
         f"One learner of one thread keeps up with {costs.num_fed:.1f} actors of {costs.num_worlds} worlds each. "
         f"A run shares {costs.num_worlds} worlds out among its actors. A part of each round takes as long with few "

@@ -24,8 +24,10 @@ from benchmarks.reproduce import MANY_UPDATES, RESULTS, TWO_CUBES, experiments
 from benchmarks.run_files import Run
 from service.base.errors import TandemError
 from service.base.files import os_errors, write_atomic
+from service.config import load_config
+from service.config.recipes import recipes
 
-FILES = ("env_throughput", "throughput", "world_speed", "deployed", "scaling_box", "robots",
+FILES = ("env_throughput", "throughput", "world_speed", "deployed", "scaling_box", "scaling_two", "robots",
          "time_to_skill", "transfer", "transfer_champion", "demo")  # fmt: skip
 """Names of the recorded files of which there is one each."""
 PAGES = {
@@ -49,7 +51,7 @@ PAGES = {
     "results/transfer.md": ("transfer", "transfer_champion"),
     "results/README.md": ("throughput",),
     "../README.md": ("seeds", "headline"),
-    "scaling.md": ("box", "model"),
+    "scaling.md": ("box", "model", "two_box", "two_model"),
     "hardware.md": ("demo",),
     "own_task.md": ("learned",),
     "objects.md": ("two", "tasks"),
@@ -138,6 +140,7 @@ class Report:
             "scaling.md": {
                 "box": [scaling.box_block(found["scaling_box"])],
                 "model": [scaling.model_block(found["scaling_box"], found["time_to_skill"])],
+                **two_cubes_scaling(found),
             },
         }
         for page, blocks in made.items():
@@ -234,6 +237,14 @@ def measured_blocks(found: Results) -> dict[str, Blocks]:
         "hardware.md": {"demo": [measured.demo_table(found["demo"]), measured.demo_words(found["demo"])]},
         "results/README.md": {"throughput": [measured.ratios_block(found["env_throughput"])]},
     }
+
+
+def two_cubes_scaling(found: Results) -> Blocks:
+    """Parts of the blocks about what a run with two cubes costs."""
+    if (result := found.get("scaling_two")) is None:
+        return {"two_box": [], "two_model": []}
+    env_steps = load_config(recipes()[TWO]).run.total_env_steps
+    return {"two_box": [scaling.box_block(result)], "two_model": [scaling.recipe_block(result, env_steps)]}
 
 
 @one_line_errors

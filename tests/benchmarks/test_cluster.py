@@ -194,5 +194,11 @@ def test_more_cores_by_hand():
     assert "gains from every further core;" in scaling.words(measured(0.1))
     # 200 updates of .9 s are 3 minutes, of .3 s one; eight runs of 3 minutes are 160 an hour
     assert ["16", "0.30 s", "1.0", "100 %", "160"] in [line.strip("| ").split(" | ") for line in block.splitlines()]
+    of_two = measured(0.3)
+    of_two["one_box"]["1"]["env_steps_per_s"] = 5_000.0  # 200 updates are a million env steps
+    block = scaling.recipe_block(of_two, 30_000_000)
+    # 6,000 updates of .9 s are 90 minutes: of the run of two cores, and of each of eight
+    assert ["16", "0.30 s", "30.0", "100 %", "5.3"] in [line.strip("| ").split(" | ") for line in block.splitlines()]
+    assert "| minutes to 30 M env steps |" in block
     never = {"runs": [{"reached": False}]}
     assert "| inf |" in scaling.model_block(measured(0.3), never)
