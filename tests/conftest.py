@@ -83,6 +83,12 @@ def default_signals() -> Iterator[None]:
 
 
 @pytest.fixture
+def no_artifacts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trainings of this process end without curves and films, which take up to half a minute."""
+    monkeypatch.setattr("service.runs.train.make_artifacts", lambda *arguments: {})
+
+
+@pytest.fixture
 def registry(tmp_path: Path) -> Registry:
     """An empty registry."""
     from service.registry.registry import Registry

@@ -151,10 +151,10 @@ def test_there_are_commands_to_type():
     assert verbs == {"--version", "demo", "evaluate", "play", "render", "train", "serve"}
 
 
+@pytest.mark.usefixtures("no_artifacts")
 def test_start_heres_task_is_learned_measured_and_loaded(tmp_path, monkeypatch):
     """Its commands, in order, with a tiny run; then what downstream.md does with the result."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("service.runs.train.make_artifacts", lambda directory, registry: {})
     small = {"train": SETS, "evaluate": ["--episodes", "2"]}
     typed = [words for words in commands(START) if "wall" in words[1:2] or "runs/wall-ours-her-0" in words][:2]
     assert [words[0] for words in typed] == ["train", "evaluate"]

@@ -19,12 +19,11 @@ def code_of(notebook):
     return [first, *("".join(each["source"]) for each in cells[1:])]
 
 
-@pytest.mark.usefixtures("default_signals")
+@pytest.mark.usefixtures("default_signals", "no_artifacts")
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs(notebook, tmp_path, monkeypatch):
     matplotlib.use("agg")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("service.runs.train.make_artifacts", lambda directory, registry: {})  # films take seconds
     scope = {}
     for cell in code_of(notebook):
         exec(compile(cell, notebook.name, "exec"), scope)

@@ -53,9 +53,8 @@ def test_a_policy_is_evaluated_in_an_environment_and_as_the_command_does(champio
     envs.close()
 
 
-@pytest.mark.usefixtures("default_signals")
+@pytest.mark.usefixtures("default_signals", "no_artifacts")
 def test_training_is_what_the_command_does(tmp_path, monkeypatch):
-    monkeypatch.setattr("service.runs.train.make_artifacts", lambda directory, registry: {})
     small = (
         "game.num_worlds=4", "game.alice_steps_min=2", "game.alice_steps=4", "game.bob_steps=4",
         "run.evaluation_interval=0", "run.final_episodes=2", "run.num_threads=1", "run.total_env_steps=1000000",

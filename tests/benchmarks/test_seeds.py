@@ -15,12 +15,11 @@ from benchmarks.report.pretraining import (
     why_alice_words,
 )
 from benchmarks.why_alice import ARMS
-from service.runs import train
 from tests.runs.runs import TREE, write_yaml
 
 
 @pytest.fixture
-def command(tmp_path, monkeypatch):
+def command(tmp_path, monkeypatch, no_artifacts):
     """Run the benchmark on a tiny recipe; returns what it wrote."""
     (tmp_path / "configs" / "pretrain").mkdir(parents=True)
     write_yaml(
@@ -29,7 +28,6 @@ def command(tmp_path, monkeypatch):
     monkeypatch.setattr(seeds, "ROOT", tmp_path)
     monkeypatch.setattr(seeds, "NUM_EPISODES", 4)
     monkeypatch.setattr(seeds, "NUM_EVALUATED", 2)
-    monkeypatch.setattr(train, "make_artifacts", lambda *arguments: {})  # a video takes half a minute
 
     def run(*words):
         given = ["tiny-one", "--runs", str(tmp_path / "runs"), "--json", str(tmp_path / "tiny.json"), *words]

@@ -27,8 +27,8 @@ def keys(tree):
     return {key: keys(value) if isinstance(value, dict) and key != "world" else None for key, value in tree.items()}
 
 
-def test_a_run_is_recorded_as_trials_were_before(tmp_path, monkeypatch):
-    monkeypatch.setattr("service.runs.train.make_artifacts", lambda *arguments: {})  # a video takes half a minute
+@pytest.mark.usefixtures("no_artifacts")
+def test_a_run_is_recorded_as_trials_were_before(tmp_path):
     config = trial_config("wall", "ours-her", 0, "panda-cube@seed-30", SMALL)
     result = run_trial(config, REGISTRY, tmp_path / "run")
     before = recorded("wall-ours-her-0")

@@ -108,12 +108,12 @@ def asked(monkeypatch, tmp_path):
     return seen
 
 
+@pytest.mark.usefixtures("no_artifacts")
 def test_the_examples_of_pretraining(monkeypatch, tmp_path):
     """As they stand there, one after the other, with a tiny configuration where the shipped one would be.
 
     What they do with ``--runtime ray`` is shown in tests/runs and tests/cluster.
     """
-    monkeypatch.setattr("service.runs.train.make_artifacts", lambda directory, registry: {})
     monkeypatch.chdir(tmp_path)
     commands = [
         shlex.split(line, comments=True) for line in re.findall(r"^\$ tandem (train .*)$", EXAMPLES, re.MULTILINE)

@@ -27,10 +27,9 @@ SETS = [
 
 
 @pytest.fixture(autouse=True)
-def nowhere(tmp_path, monkeypatch):
+def nowhere(tmp_path, monkeypatch, no_artifacts):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("TANDEM_REGISTRY", raising=False)
-    monkeypatch.setattr("service.runs.train.make_artifacts", lambda directory, registry: {})
 
 
 @pytest.fixture(scope="module")

@@ -43,9 +43,8 @@ pytestmark = pytest.mark.usefixtures("default_signals")
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch):
+def quick(monkeypatch, no_artifacts):
     monkeypatch.delenv("TANDEM_REDIS_URL", raising=False)
-    monkeypatch.setattr(module, "make_artifacts", lambda directory, registry: {})
     monkeypatch.setattr(redis_writer, "TICK_S", 0.02)
 
 

@@ -47,8 +47,8 @@ def leave_out_a_line(path):
     path.write_bytes(b"".join(lines[:1] + lines[2:]))
 
 
+@pytest.mark.usefixtures("no_artifacts")
 def test_what_is_lost_of_the_records_is_named_and_noted_once(run, tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(training, "make_artifacts", lambda directory, registry: {})
     last = newest(run).step
     leave_out_a_line(run / "metrics.jsonl")
     with (run / "goals.jsonl").open("ab") as file:

@@ -346,10 +346,9 @@ def test_how_the_process_of_a_run_ends(tmp_path, monkeypatch, script, asked, sta
 # --- a whole one -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("default_signals")
+@pytest.mark.usefixtures("default_signals", "no_artifacts")
 def test_a_study_is_killed_stopped_resumed_and_names_its_best(tmp_path, monkeypatch):
     monkeypatch.setattr(study_results, "SELECTION_EPISODES", 20)
-    monkeypatch.setattr(training, "make_artifacts", lambda directory, registry: {})
     path, registry = tmp_path / "study", tmp_path / "registry"
     study, common = Study(path), ("pretrain", "--run-dir", path, "--registry", registry)
     places = {seed: RunDirectory(path / f"seed-{seed}") for seed in (3, 8)}

@@ -6,7 +6,6 @@ import sys
 import pytest
 
 from service.base.errors import TandemError
-from service.runs import train as module
 from service.runs.trackers import Trackers
 from tests.cli.typed import assert_refused, tandem
 from tests.methods.trials import SETS
@@ -53,10 +52,9 @@ def refuses(name, config):
 
 
 @pytest.fixture(autouse=True)
-def written(tmp_path, monkeypatch):
+def written(tmp_path, monkeypatch, no_artifacts):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("TANDEM_REDIS_URL", raising=False)
-    monkeypatch.setattr(module, "make_artifacts", lambda directory, registry: {})
     (tmp_path / "trackers_of_a_test.py").write_text(CODE)
     yield
     sys.modules.pop("trackers_of_a_test", None)
