@@ -52,7 +52,7 @@ PAPERS = {
 """Numbers at arXiv and citations, as in ``docs/bibliography.md``, which does not come with the package."""
 _RATE = re.compile(r"evaluation/(?:(\w+)_)?success_(last|ever)")
 _HISTORY = "Settings that changed on the way, and records that were lost:"
-_SUCCESS = "Share of episodes in which the object was at its goal, in simulation and without noise in the actions:"
+_SUCCESS = "Share of episodes in which every object was at its goal, in simulation and without noise in the actions:"
 _OWN = "Share of episodes that succeeded as the task says, in simulation and without noise in the actions:"
 _WHEN = {"last": "success at the last step", "ever": "success at any step"}
 
@@ -163,7 +163,7 @@ def _kind(manifest: Manifest) -> tuple[str, str, str, list[str]]:
         learned = "from other ones, which saw more and had been learned by self-play (distillation)"
     return (
         f"{_at(config, 'policy', 'bob', 'num_primitives') or 'The'} frozen primitives of Tandem, and the gate that "
-        f"composes them: a policy that brings an object to a goal. They were learned {learned}. No task and no reward "
+        f"composes them: a policy that brings objects to goals. They were learned {learned}. No task and no reward "
         "was written for them. New tasks are learned by composing them.",
         f'bob = tandem.load("{name}", registry="registry")\n'
         "action = bob.policy.act_deterministic(observation)  "

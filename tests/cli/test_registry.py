@@ -19,6 +19,7 @@ from tests.cli.typed import assert_refused, tandem
 from tests.registry.helpers import Publish, files_in
 
 Run = Callable[..., Any]
+BUNDLED_NAMES = ("panda-cube", "panda-cube-robust", "panda-two-cubes")
 
 
 @pytest.fixture
@@ -35,7 +36,7 @@ def test_list(run: Run) -> None:
     assert lines[0] == ["name", "version", "where", "created", "bytes", "aliases", "parent", "kind"]
     assert [line[:3] for line in lines[1:3]] == [["panda-cube", str(n), "yours"] for n in (1, 2)]
     assert lines[2][5:] == ["latest", "panda-cube@1", "primitives"]
-    bundled = [Registry(BUNDLED).resolve(f"{name}@champion") for name in ("panda-cube", "panda-cube-robust")]
+    bundled = [Registry(BUNDLED).resolve(f"{name}@champion") for name in BUNDLED_NAMES]
     assert [line[:3] for line in lines[3:]] == [[each.name, str(each.number), "bundled"] for each in bundled]
     rows = json.loads(run("list", "--json").stdout)
     assert [(row["name"], row["version"], row["aliases"], row["parent"], row["where"]) for row in rows[:2]] == [
@@ -61,7 +62,7 @@ def test_list_of_an_empty_registry_has_what_comes_with_tandem(tmp_path: Path, di
     assert result.stderr == f"nothing published in {path} yet\n"
     rows = json.loads(result.stdout)
     assert [(row["name"], row["aliases"], row["where"]) for row in rows] == [
-        (name, ["champion", "latest"], "bundled") for name in ("panda-cube", "panda-cube-robust")
+        (name, ["champion", "latest"], "bundled") for name in BUNDLED_NAMES
     ]
     assert list(tmp_path.iterdir()) == []
 

@@ -84,7 +84,11 @@ def test_skills_and_orchestrators_have_cards_of_their_own(registry: Registry, pu
 
 def test_a_card_says_how_primitives_were_learned():
     manifests = Registry(BUNDLED)
-    for name, said in (("panda-cube", "learned by self-play"), ("panda-cube-robust", "learned from other ones")):
+    for name, said in (
+        ("panda-cube", "learned by self-play"),
+        ("panda-cube-robust", "learned from other ones"),
+        ("panda-two-cubes", "learned by self-play"),
+    ):
         body = model_card(manifests.manifest(f"{name}@latest"))
         assert [each for each in ("learned by self-play,", "learned from other ones,") if each in body] == [f"{said},"]
 

@@ -117,6 +117,7 @@ def test_primitives(client):
     assert [(each["name"], each["origins"]) for each in bundled] == [
         ("panda-cube", ["bundled"]),
         ("panda-cube-robust", ["bundled"]),
+        ("panda-two-cubes", ["bundled"]),
     ]
 
 
