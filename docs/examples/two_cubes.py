@@ -1,6 +1,6 @@
 """Four tasks for primitives of a world of two cubes: the first one is red, the second one blue.
 
-tandem train docs/examples/two_cubes.py:STACK --primitives NAME@ALIAS --method ours-her
+tandem train docs/examples/two_cubes.py:STACK --primitives panda-two-cubes@champion --method ours-her
 """
 
 import numpy as np
