@@ -145,7 +145,7 @@ class Report:
         }
         for page, blocks in made.items():
             path = self._docs / page
-            text = replace_blocks(path, {name: "\n\n".join(blocks[name]) for name in PAGES[page]})
+            text = replace_blocks(path, {name: "\n\n".join(blocks[name]).rstrip() for name in PAGES[page]})
             write_atomic(path, text.encode())
             self.files.append(path)
         self.files += write_results(self._results, trials)
