@@ -89,7 +89,7 @@ def box_block(result: Mapping[str, Any]) -> str:
     """One box, in Markdown, for ``docs/scaling.md``."""
     rows = []
     for num, each in result["one_box"].items():
-        spent = {role: 1e6 * cores / each["env_steps_per_s"] for role, cores in each["cores"].items()}
+        spent = {role: _step_us(each, role) for role in each["cores"]}
         rows.append(
             (num, f"{each['num_worlds']}", f"{each['env_steps_per_s']:,.0f}", f"{each['iteration_s']:.2f} s",
              percent(each["learner_idle_share"]), percent(each["actor_idle_share"]),
@@ -101,6 +101,23 @@ def box_block(result: Mapping[str, Any]) -> str:
     where = result["machine"]
     words = f"{where['cpu']}, {where['num_cpus']} cores, {commit(where['git_commit'])}, {where['time'][:10]}."
     return f"{words}\n\n{table(head, rows)}"
+
+
+def beside(result: Mapping[str, Any], other: Mapping[str, Any], name: str) -> str:
+    """How a run compares with the ``other``, measured on the same machine at the same hour, in words."""
+    here, there = result["one_box"], other["one_box"]
+    shares = [f"{here[num]['env_steps_per_s'] / there[num]['env_steps_per_s']:.2f}" for num in ("1", "2")]
+    costs = [f"{_step_us(here['1'], role) / _step_us(there['1'], role):.2f}" for role in ("actor", "learner")]
+    return (
+        f"That is {shares[0]} (one actor) and {shares[1]} (two) of the env steps/s of {name}, measured at the same "
+        f"hour. With one actor an env step takes {costs[0]} times as much CPU time in the actor and {costs[1]} in the "
+        "learner."
+    )
+
+
+def _step_us(each: Mapping[str, Any], role: str) -> float:
+    """CPU time of an env step in the processes of a role."""
+    return float(1e6 * each["cores"][role] / each["env_steps_per_s"])
 
 
 @dataclass(frozen=True, slots=True)

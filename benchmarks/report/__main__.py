@@ -27,8 +27,8 @@ from service.base.files import os_errors, write_atomic
 from service.config import load_config
 from service.config.recipes import recipes
 
-FILES = ("env_throughput", "throughput", "world_speed", "deployed", "scaling_box", "scaling_two", "robots",
-         "time_to_skill", "transfer", "transfer_champion", "demo")  # fmt: skip
+FILES = ("env_throughput", "throughput", "world_speed", "deployed", "scaling_box", "scaling_one", "scaling_two",
+         "robots", "time_to_skill", "transfer", "transfer_champion", "demo")  # fmt: skip
 """Names of the recorded files of which there is one each."""
 PAGES = {
     "results/pretraining.md": (
@@ -241,10 +241,14 @@ def measured_blocks(found: Results) -> dict[str, Blocks]:
 
 def two_cubes_scaling(found: Results) -> Blocks:
     """Parts of the blocks about what a run with two cubes costs."""
-    if (result := found.get("scaling_two")) is None:
+    one, two = (found.get(name) for name in ("scaling_one", "scaling_two"))
+    if one is None or two is None:
         return {"two_box": [], "two_model": []}
     env_steps = load_config(recipes()[TWO]).run.total_env_steps
-    return {"two_box": [scaling.box_block(result)], "two_model": [scaling.recipe_block(result, env_steps)]}
+    return {
+        "two_box": [scaling.box_block(two), scaling.beside(two, one, "one cube")],
+        "two_model": [scaling.recipe_block(two, env_steps)],
+    }
 
 
 @one_line_errors

@@ -202,3 +202,15 @@ def test_more_cores_by_hand():
     assert "| minutes to 30 M env steps |" in block
     never = {"runs": [{"reached": False}]}
     assert "| inf |" in scaling.model_block(measured(0.3), never)
+
+
+def test_a_run_is_compared_with_another_by_env_steps_and_by_cpu_time():
+    def box(env_steps_per_s, actor, learner):
+        return {"env_steps_per_s": env_steps_per_s, "cores": {"actor": actor, "learner": learner}}
+
+    here = {"one_box": {"1": box(600.0, 0.9, 0.12), "2": box(900.0, 1.8, 0.2)}}
+    there = {"one_box": {"1": box(800.0, 0.8, 0.2), "2": box(1500.0, 1.6, 0.4)}}
+    words = scaling.beside(here, there, "one cube")
+    assert words.startswith("That is 0.75 (one actor) and 0.60 (two) of the env steps/s of one cube")
+    # an env step: .9 s / 600 beside .8 s / 800, and .12 s / 600 beside .2 s / 800
+    assert words.endswith("takes 1.50 times as much CPU time in the actor and 0.80 in the learner.")
