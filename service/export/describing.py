@@ -23,7 +23,7 @@ from service.envs.observations import (
     VECTOR,
     Entry,
     Kind,
-    ObservationLayout,
+    Layouts,
     layouts,
 )
 from service.envs.reach import Reach
@@ -45,9 +45,9 @@ _COMPONENTS: Mapping[Kind, tuple[str, ...]] = {
 _MEANINGS = {
     "effector": "the tip: the point between the fingertips",
     "fingers": "distance of each fingertip from the middle; 0 is closed, their sum is the width",
-    "object": "centre of the object; its orientation is not seen",
-    "object_from_effector": "object minus effector",
-    "goal": "where the object's centre should be",
+    "object": "its centre; its orientation is not seen",
+    "object_from_effector": "its centre minus effector",
+    "goal": "where its centre should be",
     DELAY: "by how many steps the positions above are late, or commands are carried out late; 0 for neither",
 }
 _COMMAND_MEANING = "the action sent {} ago, clipped to [-1, 1]; 0 where there was none yet"
@@ -74,7 +74,7 @@ def describe(
         measured: in its world.
     """
     world, frozen = trained.world, trained.trained
-    robot, seen, shape = described(world), layouts(world), world.shape
+    robot, seen = described(world), layouts(world)
     parts = {"policy": trained} if frozen is None else {"orchestrator": trained, "primitives": frozen}
     widest_m = robot.opening_m if world.gripper == "free" else 0.0
     with WorldBatch(world, 1) as worlds:
@@ -84,7 +84,7 @@ def describe(
         turn = bool(worlds.robot.turning.any())
     most = _each(robot.finger_max_force, robot)
     return {
-        "format_version": 1,
+        "format_version": 2,
         "name": trained.name if frozen is None else f"{trained.name} with {frozen.name}",
         "kind": "bob" if trained.task is None else "orchestrator",
         "task": None if trained.task is None else trained.task.name,  # that an orchestrator was trained for
@@ -97,7 +97,7 @@ def describe(
         },
         "rate_hz": 1.0 / (world.physics_step_s * world.num_substeps),  # of observations and actions
         "networks": [_network(file, *found) for file, found in networks.items()],
-        "observation": [_field(seen.bob, entry) for entry in seen.bob.entries],
+        "observation": [field for entry in seen.bob.entries for field in _fields(entry, seen)],
         "observation_size": seen.bob.size,
         "positions_size": seen.positions.size,  # the first numbers of an observation, all that primitives see
         "action": _action(),
@@ -126,13 +126,17 @@ def describe(
             "coupling": _COUPLING,
         },
         "workspace": {"lower_m": world.workspace.lower_m, "upper_m": world.workspace.upper_m},  # of goals and objects
-        "object": {
-            "shape": shape.shape,
-            "extent_m": shape.extent_m,
-            "mass_kg": world.object_mass_kg,
-            "friction": world.friction,
-            "pad_friction": world.pad_friction,  # of the fingertips on it
-        },
+        "objects": [  # that have goals, in the order of the observation
+            {
+                "shape": body.shape,
+                "extent_m": body.extent_m,
+                "mass_kg": body.mass_kg,
+                "friction": body.friction,
+                "color": body.color,
+                "pad_friction": world.pad_friction,  # of the fingertips on it
+            }
+            for body in world.bodies
+        ],
         "fixtures": fixtures,  # that are the same in every episode; the box of the task box is elsewhere in each
         "success_distance_m": trained.success_distance_m,
         "measured": measured,
@@ -167,20 +171,30 @@ def _network(file: str, network: Network, differences: tuple[float, float]) -> d
     }
 
 
-def _field(layout: ObservationLayout, entry: Entry) -> dict[str, Any]:
-    """Some numbers of an observation that stand one after the other, from column ``first`` on."""
+def _fields(entry: Entry, seen: Layouts) -> list[dict[str, Any]]:
+    """Numbers of an observation that stand one after the other, from column ``first`` on: of each object its own."""
     meaning = _MEANINGS.get(entry.name, entry.name.replace("_", " "))
     if entry.name.startswith(COMMAND_PREFIX):
         age = entry.name.removeprefix(COMMAND_PREFIX)
         meaning = _COMMAND_MEANING.format("1 step" if age == "1" else f"{age} steps")
-    return {
-        "name": entry.name,
-        "first": layout[entry.name].start,
-        "components": _COMPONENTS[entry.kind],
-        "unit": entry.unit,
-        "frame": "world" if entry.kind == VECTOR else None,
-        "meaning": meaning,
-    }
+    num = seen.num_objects if entry.of_each_object else 1
+    size, start = len(entry.kind.source) // num, seen.bob[entry.name].start
+    kind = Kind(entry.kind.source[:size], entry.kind.sign[:size])
+    return [
+        {
+            "name": entry.name if number == 1 else f"{entry.name}_{number}",
+            "first": start + size * (number - 1),
+            "components": _COMPONENTS[kind],
+            "unit": entry.unit,
+            "frame": "world" if kind == VECTOR else None,
+            "meaning": f"of {_which(number, num)}: {meaning}" if entry.of_each_object else meaning,
+        }
+        for number in range(1, num + 1)
+    ]
+
+
+def _which(number: int, num: int) -> str:
+    return "the object" if num == 1 else f"object {number}"
 
 
 def _action() -> list[dict[str, Any]]:
@@ -303,9 +317,8 @@ arm that does at once what the action asks for moves too far.** Match the share 
 
 ## Where it plays
 
-Objects and goals are in {box} m; in {measured[motion][outside_workspace]:.1%} of steps the tip is outside. The \
-object: {object[shape]}, {size} mm, {object[mass_kg]:g} kg. Episodes start with the tip at {home_m} m and the gripper \
-open by {home_mm:.0f} mm.
+Objects and goals are in {box} m; in {measured[motion][outside_workspace]:.1%} of steps the tip is outside. \
+{things}. Episodes start with the tip at {home_m} m and the gripper open by {home_mm:.0f} mm.
 """
 _TASK = "\nThe task: {}.\n"
 _FIXTURES = "\nThese stand on the table, here by the upright boxes around them; it does not see them:\n\n{}\n"
@@ -384,7 +397,7 @@ def make_readme(about: Description, start: FloatArray) -> str:
         told="It is told how late they are, by `delay`. " if observes_delay else "",
         tolerated_ms=about["tolerated_late_steps"] * step_ms,
         box=", ".join(f"{axis} {bounds}" for axis, bounds in zip("xyz", _ranges(about["workspace"]), strict=True)),
-        size=" x ".join(f"{1e3 * each:g}" for each in about["object"]["extent_m"]),
+        things=_things(about["objects"]),
         home_m=", ".join(f"{each:.3f}" for each in about["home"]["effector_m"]),
         home_mm=1e3 * about["home"]["width_m"],
     )
@@ -408,6 +421,16 @@ def program(about: Description, start: FloatArray) -> str:
         inputs=", ".join(f'"{one["name"]}": {given[one["name"]]}' for one in network["inputs"]),
         call=_CALL[name],
     )
+
+
+def _things(objects: Sequence[Mapping[str, Any]]) -> str:
+    """What each object is, in words."""
+    words = []
+    for number, one in enumerate(objects, 1):
+        size = " x ".join(f"{1e3 * each:g}" for each in one["extent_m"])
+        words.append(f"{_which(number, len(objects))} is a {one['shape']} of {size} mm and {one['mass_kg']:g} kg")
+    said = ", ".join(words)
+    return said[0].upper() + said[1:]
 
 
 def _pressing(gripper: Mapping[str, Any]) -> str:

@@ -58,7 +58,7 @@ def export(
         ParityError: what was written does not compute what the evaluator's policy does; nothing is left.
         StorageError: the folder is there already, or cannot be written.
     """
-    chosen, found = find_format(format_name), networks_of(trained.of_one_object(by="tandem export"), part)
+    chosen, found = find_format(format_name), networks_of(trained, part)
     trained = trained.nominal
     with new_directory(folder) as temporary, os_errors("write", temporary):
         measured, observations = measure(trained, num_episodes)

@@ -84,14 +84,19 @@ def _in_torch(network: Network) -> tuple[nn.Module, tuple[Tensor, ...]]:
         return lambda *values, out=None: operation(*values)
 
     xp = SimpleNamespace(
+        argsort=lambda values, axis, kind: values.sort(axis).indices,  # ONNX has no stable one; of few it is stable
+        asarray=lambda array, dtype: array.to(dtype),
         ascontiguousarray=lambda array: array,  # a copy would be made at each call
         clip=torch.clip,
         concatenate=torch.concatenate,
+        copy=torch.clone,
         exp=without_out(torch.exp),
+        int64=torch.int64,
         maximum=without_out(lambda values, least: values.clip(min=least)),
         minimum=without_out(lambda values, most: values.clip(max=most)),
         repeat=torch.repeat_interleave,
         stack=torch.stack,
+        take_along_axis=lambda values, places, axis: values.gather(axis, places.expand_as(values)),
         tanh=without_out(torch.tanh),
     )
 

@@ -25,7 +25,7 @@ _NUM_PLACES = 64
 _FROM_EDGE_M = 0.05
 """Distance of the places from the workspace's edge, so that no command is clipped."""
 _ABOVE_OBJECT_M = 0.12
-"""Of the lowest place; two full steps down end above the object."""
+"""Of the lowest place; two full steps down end above every object."""
 _MAX_LATE_STEPS = 2
 _TOLERATED_LOSS = 0.1
 
@@ -116,7 +116,7 @@ def _place(worlds: WorldBatch, rng: np.random.Generator, width_m: float) -> None
     workspace = worlds.config.workspace
     edge_m = min(_FROM_EDGE_M, workspace.length_x_m / 4, workspace.length_y_m / 4, workspace.height_m / 4)
     lower, upper = np.array(workspace.lower_m) + edge_m, np.array(workspace.upper_m) - edge_m
-    lower[2] = min(worlds.config.shape.extent_m[2] + _ABOVE_OBJECT_M, upper[2])
+    lower[2] = min(2.0 * max(worlds.config.rest_heights_m) + _ABOVE_OBJECT_M, upper[2])
     places = worlds.reach.clip(rng.uniform(lower, upper, (worlds.num_worlds, 3)))
     worlds.reset(rng)
     states = worlds.states.copy()

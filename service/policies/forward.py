@@ -80,7 +80,8 @@ def prepared(xp: Any, parameters: Parameters) -> dict[str, Any]:
         name: xp.ascontiguousarray(array.T) if name.endswith(".weight") else array[()]  # scalars are faster so
         for name, array in parameters.items()
     }
-    ready |= {name: array.astype(int) for name, array in parameters.items() if name.endswith(".by_object")}
+    of_objects = [name for name in parameters if name.endswith(".by_object")]
+    ready |= {name: xp.asarray(parameters[name], dtype=xp.int64) for name in of_objects}
     for squash, bias in (("squash", "output.bias"), ("primitives.squash", "primitives.output_bias")):
         if bias in parameters:
             low, high = ready.pop(f"{squash}.log_std_min"), ready.pop(f"{squash}.log_std_max")
@@ -230,9 +231,9 @@ def _nearest_first(xp: Any, rows: Array, by_object: Array) -> Array:
 
     The first three numbers of each are its way from there.
     """
-    objects, rows = rows[:, by_object], rows.copy()
+    objects, rows = rows[:, by_object], xp.copy(rows)
     order = xp.argsort((objects[:, :, :3] ** 2).sum(-1), axis=1, kind="stable")
-    rows[:, by_object] = xp.take_along_axis(objects, order[:, :, None], 1)
+    rows[:, by_object] = xp.take_along_axis(objects, order[:, :, None], axis=1)
     return rows
 
 

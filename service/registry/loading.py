@@ -237,16 +237,6 @@ class Trained:
             )
         return replace(self, task=task, alice=None)
 
-    def of_one_object(self, by: str) -> Trained:
-        """Itself, if it moves one object.
-
-        Raises:
-            TandemError: it moves several.
-        """
-        if (num := self.config.world.num_objects) > 1:
-            raise TandemError(f"{self.label} moves {num} objects; {by} knows one")
-        return self
-
     def expect(self, *kinds: Kind, by: str) -> Trained:
         """Itself, if it is of one of these kinds.
 

@@ -47,9 +47,11 @@ def for_robot(trained: Trained) -> Trained:
     """The same in its nominal world, where it was trained in worlds that are drawn: a robot is one.
 
     Raises:
-        TandemError: skills, a policy that composes nothing, or one of another robot.
+        TandemError: skills, a policy that composes nothing, or one of another robot or of several objects.
     """
-    trained.expect("primitives", "orchestrator", by="tandem robot").of_one_object(by="tandem robot")
+    trained.expect("primitives", "orchestrator", by="tandem robot")
+    if (num := trained.config.world.num_objects) > 1:
+        raise TandemError(f"{trained.label} moves {num} objects; tandem robot knows one")
     if trained.kind == "orchestrator" and trained.trained is None:
         raise TandemError(f"{trained.label} acts without primitives; a bridge plays what composes them")
     check_robot(trained.trained or trained)

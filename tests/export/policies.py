@@ -20,6 +20,7 @@ WORLD = WorldConfig(physics_step_s=0.005, num_substeps=8, observed={"num_command
 SEEN = layouts(WORLD)
 BOB = MCPConfig(num_primitives=2, trunk_hidden_sizes=(24, 12), primitive_hidden_size=9, gate_hidden_sizes=(16,))
 CONFIG = SelfPlayConfig(name="made", world=WORLD, policy=PolicyConfig(bob=BOB), run=RunConfig(evaluation_steps=4))
+TWO_CUBES = CONFIG.model_copy(update={"world": WORLD.model_copy(update={"objects": ("cube", "cube")})})
 MONOLITHIC = CONFIG.model_copy(
     update={"policy": PolicyConfig(bob=BOB, monolithic_bob=MLPConfig(hidden_sizes=(20, 10)))}
 )
@@ -37,15 +38,15 @@ def scattered(module):
 def parameters_of(config):
     with torch.random.fork_rng():
         torch.manual_seed(3)
-        return scattered(make_bob(config.policy, SEEN))
+        return scattered(make_bob(config.policy, layouts(config.world)))
 
 
-def actor_of(method):
+def actor_of(method, seen=SEEN):
     """Of a policy of a task; it sets the weights of Bob's primitives, or acts by itself."""
     composed = BOB.num_primitives if METHODS[method].composes else 4
     with torch.random.fork_rng():
         torch.manual_seed(4)
-        actor = GaussianActor(num_inputs(SEEN)[1], composed + (4 if METHODS[method].residual else 0), (16, 12))
+        actor = GaussianActor(num_inputs(seen)[1], composed + (4 if METHODS[method].residual else 0), (16, 12))
         return scattered(actor)
 
 

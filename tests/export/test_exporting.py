@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from service.base.errors import ParityError
+from service.config import WorldConfig
 from service.config.robot import read_robot
+from service.envs.observations import layouts
 from service.export.exporting import export
 from service.export.measurements import measure, tolerated_late_steps
 from service.registry.bundled import BUNDLED
@@ -114,10 +116,10 @@ def test_what_a_bridge_must_know(run, tmp_path):
     assert home["effector_m"] == pytest.approx((-0.05, 0.0, 0.08), abs=1e-3)
     assert list(home["joints"]) == [f"joint{number}" for number in range(1, 8)]
     assert home["width_m"] == pytest.approx(0.08)
-    assert about["object"]["shape"] == "box"
-    assert about["object"]["extent_m"] == [0.05] * 3
+    (thing,) = about["objects"]
+    assert (thing["shape"], thing["extent_m"]) == ("box", [0.05] * 3)
     assert about["measured"]["motion"]["num_episodes"] == 3
-    expected = {"format_version": 1, "name": "made@1", "kind": "bob", "task": None, "rate_hz": 25.0, "fixtures": []}
+    expected = {"format_version": 2, "name": "made@1", "kind": "bob", "task": None, "rate_hz": 25.0, "fixtures": []}
     expected |= {"success_distance_m": 0.05, "format": "numpy"}
     assert {key: about[key] for key in expected} == expected
     assert about["tolerated_late_steps"] in (0, 1, 2)
@@ -133,7 +135,7 @@ def test_what_a_bridge_must_know(run, tmp_path):
             "| +x | 0.5",
             "of 80 mm in its",
         ),
-        *("**An arm that does at once", "| 80 ms | ", "x -0.225 to 0.125", "box, 50 x 50 x 50 mm", "open by 80 mm"),
+        *("**An arm that does at once", "| 80 ms | ", "x -0.225 to 0.125", "a box of 50 x 50 x 50 mm", "open by 80 mm"),
     ):
         assert said in readme.replace("Hold", "hold")
 
@@ -170,6 +172,36 @@ def test_an_orchestrator_with_its_primitives(run, registry, tmp_path, monkeypatc
     exec(program, scope)
     player = load(str(training), registry.root).player()
     np.testing.assert_allclose(scope["action"], player.act_deterministic(scope["observation"])[0], atol=1e-5)
+
+
+def test_two_objects_have_fields_of_their_own(registry, tmp_path, monkeypatch):
+    things = ("cube", {"shape": "cylinder", "size_m": [0.04, 0.06], "mass_kg": 0.2})
+    world = WorldConfig.model_validate({**WORLD.model_dump(exclude={"object", "objects"}), "objects": things})
+    config = CONFIG.model_copy(update={"world": world})
+    publish(registry, config, parameters_of(config), {})
+    trained = load("made@1", registry.root)
+    about = export(trained, "torchscript", tmp_path / "out", part="policy", num_episodes=2)
+    of_both = ["object", "object_2", "object_from_effector", "object_from_effector_2"]
+    fields = about["observation"]
+    assert [one["name"] for one in fields] == [
+        *("effector", "fingers", *of_both, "command_1", "command_2", "goal", "goal_2"),
+    ]
+    columns = layouts(world).bob.columns
+    assert [one["first"] for one in fields[2:4]] == [columns["object"].start, columns["object"].start + 3]
+    assert (fields[-1]["first"], fields[-1]["components"]) == (columns["goal"].stop - 3, ("x", "y", "z"))
+    assert [(one["shape"], one["mass_kg"]) for one in about["objects"]] == [("box", 0.1), ("cylinder", 0.2)]
+    readme = (tmp_path / "out" / "README.md").read_text()
+    assert (
+        "Object 1 is a box of 50 x 50 x 50 mm and 0.1 kg, object 2 is a cylinder of 40 x 40 x 60 mm and 0.2 kg."
+        in readme
+    )
+    assert "| of object 2: where its centre should be |" in readme
+    (program,) = programs(tmp_path / "out")
+    monkeypatch.chdir(tmp_path / "out")
+    scope = {}
+    exec(program, scope)
+    expected = trained.player().act_deterministic(scope["observation"])
+    np.testing.assert_allclose(scope["action"], np.clip(expected[0], -1.0, 1.0), atol=1e-5)
 
 
 def test_what_does_not_compute_the_same_is_not_left_behind(registry, tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from service.base.errors import ParityError
+from service.envs.observations import layouts
 from service.export import exporting
 from service.export.exporting import check_parity, make_inputs
 from service.export.formats import find_format
@@ -13,32 +14,41 @@ from service.export.networks import network_of_bob, network_of_orchestrator, net
 from service.policies.numpy_policy import numpy_bob
 from service.registry.learned import LearnedPolicy
 from service.registry.loading import Trained
-from tests.export.policies import CONFIG, MONOLITHIC, SEEN, actor_of, parameters_of
+from tests.export.policies import CONFIG, MONOLITHIC, SEEN, TWO_CUBES, actor_of, parameters_of
+
+
+def bob_of(config):
+    parameters = parameters_of(config)
+    return Trained("made", "primitives", config, numpy_bob(parameters), parameters)
 
 
 def learned(bob, method):
-    actor = actor_of(method)
-    policy = LearnedPolicy(actor, bob.primitives, SEEN)
-    return Trained("made", "orchestrator", CONFIG, policy, actor, task="push", method=method, trained=bob)
+    seen = layouts(bob.config.world)
+    actor = actor_of(method, seen)
+    policy = LearnedPolicy(actor, bob.primitives, seen)
+    return Trained("made", "orchestrator", bob.config, policy, actor, task="push", method=method, trained=bob)
 
 
 def networks():
-    parameters = parameters_of(CONFIG)
-    bob = Trained("made", "primitives", CONFIG, numpy_bob(parameters), parameters)
-    other = parameters_of(MONOLITHIC)
-    alone = Trained("made", "primitives", MONOLITHIC, numpy_bob(other), other)
+    bob, alone, of_two = bob_of(CONFIG), bob_of(MONOLITHIC), bob_of(TWO_CUBES)
     return {
         "bob": network_of_bob(bob),
         "primitive": network_of_primitive(bob, 1),
         "orchestrator": network_of_orchestrator(learned(bob, "ours-residual-her")),
         "orchestrator of weights alone": network_of_orchestrator(learned(bob, "ours")),
         "monolithic": network_of_bob(alone),
+        "bob of two cubes": network_of_bob(of_two),
+        "orchestrator of two cubes": network_of_orchestrator(learned(of_two, "ours-residual-her")),
     }
+
+
+def inputs_of(seen):
+    return make_inputs(0.1 * np.random.default_rng(2).standard_normal((5, 40, seen.bob.size)), seen)
 
 
 @pytest.fixture(scope="module")
 def inputs():
-    return make_inputs(0.1 * np.random.default_rng(2).standard_normal((5, 40, SEEN.bob.size)), SEEN)
+    return inputs_of(SEEN)
 
 
 def written(network, format_name, folder):
@@ -52,11 +62,12 @@ def written(network, format_name, folder):
     ("format_name", "name"),
     [
         *((each, name) for each in ("numpy", "torchscript") for name in networks()),
-        ("onnx", "orchestrator"),  # has every operation that the others have; torch takes seconds for each
+        ("onnx", "orchestrator of two cubes"),  # has every operation of the others; torch takes seconds for each
     ],
 )
-def test_parity(format_name, name, inputs, tmp_path):
+def test_parity(format_name, name, tmp_path):
     network = networks()[name]
+    inputs = inputs_of(layouts((TWO_CUBES if "two cubes" in name else CONFIG).world))
     found = check_parity(network, written(network, format_name, tmp_path), *inputs)
     assert 0.0 <= found[0] <= exporting.TOLERANCE == 1e-5
     assert found[1] <= exporting.EXTREME_TOLERANCE == 1e-4

@@ -12,7 +12,6 @@ from service.config import load_config, parse_config
 from service.config.recipes import recipes
 from service.envs.observations import distances, each_object
 from service.envs.tasks import find_task
-from service.export.exporting import export
 from service.methods.task import _mixed
 from service.robot.play.game import Game
 from service.robot.running import for_robot
@@ -114,11 +113,9 @@ def test_goals_are_typed_for_all(two):
         parse_goals("-0.1,0,0.02,0.9,0.1,0.02", two.world)
 
 
-def test_who_knows_one_object_says_so(two, tmp_path):
+def test_who_knows_one_object_says_so(two):
     with pytest.raises(TandemError, match=r"moves 2 objects; tandem robot knows one"):
         for_robot(two)
-    with pytest.raises(TandemError, match=r"moves 2 objects; tandem export knows one"):
-        export(two, "numpy", tmp_path / "out")
     more = replace(find_task("push"), world={"objects": ["cube", "cube"]})
     with pytest.raises(TandemError, match="was trained in a world of 1 object, and Push has 2"):
         service.load().playing(more)
