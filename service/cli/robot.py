@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 from pydantic import ValidationError
 
@@ -19,6 +20,7 @@ from service.cli.evaluate import parse_points
 from service.config.load import explained
 from service.config.tree import apply_override
 from service.config.world import WorldConfig
+from service.envs.observations import each_object
 from service.runs.signals import StopSignals
 
 if TYPE_CHECKING:
@@ -49,9 +51,13 @@ _DeadMan = Annotated[
 def run(
     robot: _Robot,
     policy: _Policy = CHAMPION,
-    goal: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Metres; default: random ones.")] = None,
+    goal: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", help="Metres, of one object after the other; default: random ones.")
+    ] = None,
     episodes: Annotated[int, typer.Option(help="Number of goals.", min=1)] = 1,
-    steps: Annotated[int, typer.Option(help="Control steps of each.", min=1)] = 50,
+    steps: Annotated[
+        int | None, typer.Option(help="Control steps of each; default: as the policy is evaluated.", min=1)
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of random goals.", min=0)] = 0,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Command nothing, print what would be.")] = False,
     calibration: Annotated[Path | None, typer.Option(metavar="FILE", help="Of this robot's response.")] = None,
@@ -61,7 +67,7 @@ def run(
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
     registry: SourceOption = SOURCE,
 ) -> None:
-    """Bring the object to goals; Ctrl-C stops the robot first."""
+    """Bring objects to goals; Ctrl-C stops the robot first."""
     from service.robot.backends import read_backend
     from service.robot.calibrate import read_calibration
     from service.robot.loop import Bridge
@@ -99,7 +105,14 @@ def run(
         written = None if log is None else open_log(log, header, player.world)
         outcomes = []
         for outcome in play(
-            bridge, backend, player, goal_m=goal_m, num_episodes=episodes, num_steps=steps, seed=seed, ready=ready
+            bridge,
+            backend,
+            player,
+            goal_m=goal_m,
+            num_episodes=episodes,
+            num_steps=steps or player.num_steps,
+            seed=seed,
+            ready=ready,
         ):
             outcomes.append(outcome)
             if not as_json:
@@ -154,14 +167,15 @@ def replay(
 
 
 def parse_goal(text: str, world: WorldConfig) -> StateArray:
-    """(3,) a goal of a robot in metres, no lower than where the object lies on the table.
+    """(3 K,) a goal of a robot in metres, no lower than where each object lies on the table.
 
     Raises:
         TandemError: another goal, or several; or as for ``parse_points``.
     """
     goals = parse_points("--goal", text, world, "a point")
-    if len(goals) > 1 or goals[0, 2] < round(world.rest_height_m, 6):
-        raise TandemError(f"--goal {text}: write one point, no lower than the object lies, {world.rest_height_m:.3f} m")
+    if len(goals) > 1 or (each_object(goals[0])[:, 2] < np.round(world.rest_heights_m, 6)).any():
+        lowest = " and ".join(f"{height_m:.3f}" for height_m in world.rest_heights_m)
+        raise TandemError(f"--goal {text}: write one point, no lower than the object lies, {lowest} m")
     goal: StateArray = goals[0]
     return goal
 

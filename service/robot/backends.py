@@ -1,4 +1,4 @@
-"""Back-ends by name: what makes a robot, and what sees its object, of a few words and parameters."""
+"""Back-ends by name: what makes a robot, and what sees its objects, of a few words and parameters."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ class Simulator(Protocol):
     """What a simulated robot offers besides: new starts, and the truth."""
 
     def reset(self, object_m: StateArray) -> None:
-        """Put the arm to its start with an open gripper, and the object on the table at (3,) metres; time goes on.
+        """Put the arm to its start with an open gripper, and K objects on the table at (3 K,) metres; time goes on.
 
-        How high it lies is the simulator's to say: its object may be another than that of the policy's world.
+        How high they lie is the simulator's to say: its objects may be others than those of the policy's world.
         """
 
     def object_position(self) -> StateArray:
-        """(3,) where the object is in truth, metres."""
+        """(3 K,) where the objects are in truth, metres."""
 
 
 class ExactPoses:
-    """Sees the object of a simulator as it is, at every moment."""
+    """Sees the objects of a simulator as they are, at every moment."""
 
     def __init__(self, robot: RobotInterface, simulator: Simulator) -> None:
         self._robot, self._simulator = robot, simulator
 
     def read(self) -> ObjectPose:
-        """The object's pose now."""
+        """Their poses now."""
         return ObjectPose(self._robot.now_s(), self._simulator.object_position())
 
     def close(self) -> None:
@@ -54,7 +54,7 @@ class ExactPoses:
 
 @dataclass(frozen=True, slots=True)
 class Backend:
-    """A robot, and what sees its object."""
+    """A robot, and what sees its objects."""
 
     robot: RobotInterface
     poses: PoseSource
@@ -62,7 +62,7 @@ class Backend:
     """None for a robot that people have to put back by hand."""
 
     def begin(self, object_m: StateArray) -> None:
-        """Begin an episode of a simulator, its object at (3,) metres; nothing is still on its way from the last one."""
+        """Begin an episode of a simulator, K objects at (3 K,) metres; nothing is on its way from the last one."""
         assert self.simulator is not None
         self.simulator.reset(object_m)
         for part in (self.robot, self.poses):

@@ -122,7 +122,7 @@ def measure_response(
     box = config.safety.box(world)
     motions = _Motions((box.lower_m + box.upper_m) / 2)
     bridge = Bridge(motions, robot, None, world, config, held=held, record=rows.append)
-    bridge.run(np.zeros(3), motions.num_steps)
+    bridge.run(np.zeros(3 * world.num_objects), motions.num_steps)
     effector = np.array([row["effector_m"] for row in rows])
     shares, delays = np.empty(len(_DIRECTIONS)), np.empty(len(_DIRECTIONS))
     for index, direction in enumerate(_DIRECTIONS):

@@ -22,7 +22,7 @@ class DisturbanceConfig(FrozenModel):
 
     state_delay_s: float = Field(0.0, ge=0.0, le=1.0, description="age of what is read of the robot")
     command_delay_s: float = Field(0.0, ge=0.0, le=1.0, description="from a command to the robot")
-    pose_delay_s: float = Field(0.0, ge=0.0, le=1.0, description="age of the object's pose")
+    pose_delay_s: float = Field(0.0, ge=0.0, le=1.0, description="age of the objects' poses")
     pose_noise_m: float = Field(0.0, ge=0.0, le=0.1, description="standard deviation on each axis, anew in each pose")
     pose_offset_m: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="constant error of poses")
 
@@ -106,11 +106,12 @@ class DisturbedPoses:
         self._seen: deque[ObjectPose] = deque()
 
     def read(self) -> ObjectPose:
-        """The object as it was ``pose_delay_s`` ago, with noise and offset."""
+        """The objects as they were ``pose_delay_s`` ago, each with noise and offset."""
         pose = self._poses.read()
         if not self._seen or pose.time_s != self._seen[-1].time_s:
-            noise = self._rng.normal(0.0, self._config.pose_noise_m, 3) if self._config.pose_noise_m else 0.0
-            self._seen.append(replace(pose, position_m=pose.position_m + self._config.pose_offset_m + noise))
+            size, offset = len(pose.position_m), np.tile(self._config.pose_offset_m, len(pose.position_m) // 3)
+            noise = self._rng.normal(0.0, self._config.pose_noise_m, size) if self._config.pose_noise_m else 0.0
+            self._seen.append(replace(pose, position_m=pose.position_m + offset + noise))
         return _as_of(self._now_s() - self._config.pose_delay_s, self._seen)
 
     def forget(self) -> None:

@@ -1,4 +1,4 @@
-"""What a bridge needs of a robot and of whatever sees the object. Positions are in the world frame of the primitives.
+"""What a bridge needs of a robot and of whatever sees the objects. Positions are in the world frame of the primitives.
 
 The world's origin is the table top, 0.6 m in front of the robot's base: x away from the base, z up. A back-end converts
 from its own frame, and gives times by the clock that its ``now_s`` reads.
@@ -28,11 +28,11 @@ class RobotState:
 
 @dataclass(frozen=True, slots=True)
 class ObjectPose:
-    """Measurement of the object at one moment."""
+    """Measurement of the K objects of a policy's world at one moment."""
 
     time_s: float
     position_m: StateArray
-    """(3,) its centre; NaN where it was not seen."""
+    """(3 K,) their centres, in the order of the world's objects; NaN where one was not seen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class RobotInterface(Protocol):
 
 
 class PoseSource(Protocol):
-    """Whatever sees the object: a tracker, a camera with markers, a simulator."""
+    """Whatever sees the objects: a tracker, a camera with markers, a simulator."""
 
     def read(self) -> ObjectPose:
         """Return the newest measurement, which may be old; never waits."""

@@ -22,7 +22,7 @@ from service.base.types import FloatArray, StateArray
 from service.config.frozen import FrozenModel
 from service.config.world import WorldConfig
 from service.envs.batch import DISPLACEMENT_M, WIDTH_CHANGE_M
-from service.envs.observations import ACTION, COMMAND_PREFIX, ObservationLayout, bob_observation, layouts
+from service.envs.observations import ACTION, COMMAND_PREFIX, ObservationLayout, bob_observation, distances, layouts
 from service.robot.interface import PoseSource, RobotInterface, RobotState
 from service.robot.safety import SafeRobot, SafetyConfig, always_held
 
@@ -57,7 +57,7 @@ class Bridge:
     Args:
         policy: acts on Bob's observations; one that has ``begin`` is told of every start.
         robot: that moves.
-        poses: what sees the object; None where nothing has to.
+        poses: what sees the objects; None where nothing has to.
         world: of the policy: its step, its workspace, what it observes.
         config: of the bridge.
         gain: (3,) by which the ways of an action are multiplied; see ``calibrate``.
@@ -101,11 +101,12 @@ class Bridge:
         the robot is stopped has ``stopped``, the reason, too.
 
         Args:
-            goal_m: (3,) where the object should go, metres.
+            goal_m: (3 K,) where each object should go, metres.
             num_steps: control steps.
 
         Returns:
-            Distance from the object, as it was last seen, to the goal, metres; NaN where nothing sees it.
+            Distance from the object that is furthest from its goal, as it was last seen, to there, metres; NaN where
+            nothing sees them.
 
         Raises:
             RobotError: the robot was stopped; the message says why.
@@ -134,7 +135,7 @@ class Bridge:
             self.safe.measure(end_s)
             object_m = self.safe.object.position_m
             self._settle(end_s)
-        return float(np.linalg.norm(object_m - goal_m))
+        return float(distances(object_m, goal_m).max())
 
     def _play_step(self, row: dict[str, Any], due_s: float, goal_m: StateArray) -> None:
         safe = self.safe
@@ -195,16 +196,16 @@ def observe(
     Args:
         layout: of his positions.
         state: of the robot.
-        object_m: (3,) where the object was seen, metres.
+        object_m: (3 K,) where the objects were seen, metres.
         commands: (4,) each, the newest first: what the policy asked for in the last steps.
-        goal_m: (3,) metres.
+        goal_m: (3 K,) metres.
         delay_steps: by which what is seen, or what is commanded, is late.
     """
     measured: dict[str, StateArray | int] = {
         "effector": state.effector_m,
         "fingers": state.fingers_m,
         "object": object_m,
-        "object_from_effector": object_m - state.effector_m,
+        "object_from_effector": object_m - np.tile(state.effector_m, len(object_m) // 3),
         "delay": delay_steps,
         **{f"{COMMAND_PREFIX}{age}": command for age, command in enumerate(commands, start=1)},
     }

@@ -14,6 +14,8 @@ from service.base.types import StateArray
 from service.config.frozen import FrozenModel
 from service.config.world import WorldConfig
 from service.envs.batch import MAX_SPEED, MAX_TURN_RAD, WorldBatch
+from service.envs.observations import each_object
+from service.envs.state_layout import places_at, pose_columns
 from service.robot.backends import Backend, ExactPoses
 from service.robot.interface import Command, RobotState
 
@@ -32,8 +34,8 @@ class MujocoParameters(FrozenModel):
         "by the speed of the set-points, as the controllers of real arms do; for set-points without jumps",
     )
     joint_friction_nm: float = Field(0.0, ge=0.0, le=20.0, description="dry friction of the arm's joints")
-    object_mass_kg: float | None = Field(None, gt=0.0, le=5.0)
-    object_size_m: float | None = Field(None, ge=0.02, le=0.07)
+    object_mass_kg: float | None = Field(None, gt=0.0, le=5.0, description="of what has none of its own")
+    object_size_m: float | None = Field(None, ge=0.02, le=0.07, description="of objects that are only named")
     friction: float | None = Field(None, gt=0.0, le=3.0)
     pad_friction: float | None = Field(None, gt=0.0, le=3.0)
     physics_step_s: float | None = Field(None, gt=0.0, le=0.01, description="None: that of training")
@@ -67,7 +69,7 @@ class MujocoRobot:
         self._last: tuple[float, StateArray | None] = (0.0, None)
         """When the joints got their last set-points, and which, before they were moved on."""
         self._grip = self.model.actuator_forcerange[self._fingers].copy()
-        self.reset(self._start[self._layout["object"]])
+        self.reset(self._places(self._start).ravel())
 
     def _fit(self, given: MujocoParameters) -> None:
         """Change arm and motors of the compiled model."""
@@ -137,10 +139,11 @@ class MujocoRobot:
     # --- the simulator -----------------------------------------------------------------------------------------------
 
     def reset(self, object_m: StateArray) -> None:
-        """Put the arm to its start with an open gripper, and the object on the table at (3,) metres; time goes on."""
+        """Put the arm to its start with an open gripper, objects on the table at (3 K,) metres; time goes on."""
         now_s, layout = self._data.time, self._layout
         state = self._start.copy()
-        state[layout["object"]] = [*object_m[:2], self.world.rest_height_m]
+        places = self._places(state)
+        places[:, :2], places[:, 2] = each_object(object_m)[:, :2], self.world.rest_heights_m
         mujoco.mj_setState(self.model, self._data, state[layout.physics], mujoco.mjtState.mjSTATE_FULLPHYSICS)
         self._data.time, self._stopped = now_s, False
         self._last = (now_s, None)
@@ -150,9 +153,15 @@ class MujocoRobot:
         mujoco.mj_forward(self.model, self._data)
 
     def object_position(self) -> StateArray:
-        """(3,) where the object is, metres."""
-        position: StateArray = self._data.qpos[self._fingers.stop :][:3].copy()
-        return position
+        """(3 K,) where the objects are, metres."""
+        state = self._start.copy()
+        mujoco.mj_getState(self.model, self._data, state[self._layout.physics], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        return self._places(state).ravel()
+
+    def _places(self, state: StateArray) -> StateArray:
+        """(K, 3) the objects' centres in a state; a view."""
+        found: StateArray = places_at(state[None], pose_columns(self._layout, "object", self.world.num_objects))[0]
+        return found
 
     def _joints(self) -> StateArray:
         """(1, J)."""
@@ -171,7 +180,7 @@ def connect(world: WorldConfig, parameters: Mapping[str, Any]) -> Backend:
     if world.obstacles:  # starts would be drawn into them
         raise TandemError("robot mujoco: obstacles are elsewhere in every episode, and nothing tells a bridge where")
     given = MujocoParameters.model_validate(parameters)
-    if given.object_size_m is not None and not isinstance(world.object, str):
+    if given.object_size_m is not None and not all(isinstance(each, str) for each in (*world.objects, world.object)):
         raise TandemError("robot mujoco: parameters: object_size_m is of a cube or sphere; this object has its own")
     robot = MujocoRobot(world, given)
     return Backend(robot, ExactPoses(robot, robot), robot)

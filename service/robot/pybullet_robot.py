@@ -286,8 +286,8 @@ def world_of(world: WorldConfig, parameters: PyBulletParameters) -> WorldConfig:
         world = WorldConfig.model_validate({**world.model_dump(), **PANDA_GYM_CUBE})
     if world.robot != "panda":
         raise ConfigError(f"world.robot = {world.robot.name!r}: PyBullet has the built-in panda only")
-    if world.object != "cube":
-        raise ConfigError("world.object: PyBullet has a cube only; set world.object = cube")
+    if world.object != "cube" or world.objects:
+        raise ConfigError("world.object, world.objects: PyBullet has one cube only; play a policy of one")
     if world.fixture == "box" or world.fixtures:
         raise ConfigError("world.fixture, world.fixtures: PyBullet has no fixture or the wall; choose none or wall")
     if world.obstacles:

@@ -16,11 +16,13 @@ from pydantic import ValidationError
 from service.base.errors import RobotError, TandemError
 from service.base.files import open_regular, os_errors
 from service.base.jsonl import JsonlWriter, read_jsonl
-from service.base.types import StateArray
+from service.base.types import BoolArray, StateArray
 from service.config.frozen import first_error
 from service.config.world import WorldConfig
 from service.envs.batch import WorldBatch
+from service.envs.observations import distances, each_object
 from service.envs.sampling import Places, draw_goals, draw_objects, draw_starts
+from service.envs.state_layout import places_at, pose_columns
 from service.media.recording import RecordedEpisodes
 from service.methods.compose import check_robot
 from service.registry.loading import Trained
@@ -39,7 +41,7 @@ class Outcome:
 
     goal_m: StateArray
     distance_m: float
-    """From the object to it at the last step; of a simulator in truth, else as it was seen."""
+    """From the object that is furthest from its goal at the last step; of a simulator in truth, else as it was seen."""
     reached: bool
 
 
@@ -47,17 +49,15 @@ def for_robot(trained: Trained) -> Trained:
     """The same in its nominal world, where it was trained in worlds that are drawn: a robot is one.
 
     Raises:
-        TandemError: skills, a policy that composes nothing, or one of another robot or of several objects.
+        TandemError: skills, a policy that composes nothing, or one of another robot.
     """
     trained.expect("primitives", "orchestrator", by="tandem robot")
-    if (num := trained.config.world.num_objects) > 1:
-        raise TandemError(f"{trained.label} moves {num} objects; tandem robot knows one")
     if trained.kind == "orchestrator" and trained.trained is None:
         raise TandemError(f"{trained.label} acts without primitives; a bridge plays what composes them")
     check_robot(trained.trained or trained)
     found = trained.nominal
     if found.world.num_observed_obstacles:
-        raise TandemError(f"{found.label} observes obstacles, and the bridge measures the object alone; train without")
+        raise TandemError(f"{found.label} observes obstacles, and the bridge measures objects alone; train without")
     return found
 
 
@@ -72,14 +72,14 @@ def play(
     seed: int,
     ready: Callable[[int, StateArray], None],
 ) -> Iterator[Outcome]:
-    """Play goals; a simulator starts each with its object anywhere, as an evaluation does.
+    """Play goals; a simulator starts each with its objects anywhere, as an evaluation does.
 
     Args:
         bridge: plays the policy on the back-end's robot.
         backend: the robot.
         policy: says which goals are drawn, and what counts as reached; of a user's task whose goals are a function,
             those of the kind that comes nearest.
-        goal_m: (3,) the goal of all episodes; None: random ones.
+        goal_m: (3 K,) the goal of all episodes; None: random ones.
         num_episodes: how many.
         num_steps: of each.
         seed: of starts and goals.
@@ -90,7 +90,7 @@ def play(
     """
     rng = np.random.default_rng(seed)
     places = _starts(rng, num_episodes, policy.world, simulated=backend.simulator is not None)
-    goals = np.zeros((num_episodes, 3))
+    goals = np.zeros((num_episodes, 3 * policy.world.num_objects))
     if goal_m is None:
         goals = draw_goals(policy.tried_on.goal_kind, rng, policy.world, policy.success_distance_m, places)
     for episode in range(num_episodes):
@@ -102,7 +102,7 @@ def play(
         ready(episode, goal)
         distance_m = bridge.run(goal, num_steps)
         if backend.simulator is not None:
-            distance_m = float(np.linalg.norm(backend.simulator.object_position() - goal))
+            distance_m = float(distances(backend.simulator.object_position(), goal).max())
         yield Outcome(goal, distance_m, distance_m <= policy.success_distance_m)
 
 
@@ -148,9 +148,9 @@ def open_log(path: Path, header: Mapping[str, Any], world: WorldConfig) -> Jsonl
 
 
 def read_log(path: Path) -> tuple[WorldConfig, RecordedEpisodes]:
-    """The world of a log, and what was logged as its states: effector and object where they were measured.
+    """The world of a log, and what was logged as its states: effector and objects where they were measured.
 
-    The object is drawn upright, as only its place was seen, and shorter episodes end with a still picture.
+    Objects are drawn upright, as only their places were seen, and shorter episodes end with a still picture.
 
     Raises:
         TandemError: no such file, no log of a robot, or nothing was logged.
@@ -184,12 +184,13 @@ def _recorded(world: WorldConfig, episodes: list[list[dict[str, Any]]], success_
     goal = np.array([steps[0]["goal_m"] for steps in episodes])
     with WorldBatch(world, len(episodes), num_threads=1) as worlds:
         arm, layout = worlds.robot.arm, worlds.layout
+        objects = pose_columns(layout, "object", world.num_objects)
         states = np.tile(worlds.states, (num_steps, 1, 1))
         joints = np.tile(arm.home, (len(episodes), 1))
         for step in range(num_steps):
             joints = arm.solve(joints, effector[step], num_iterations=2 if step else _LONG_WAY)
             states[step][:, layout["joints"]] = joints
             states[step][:, layout["fingers"]] = worlds.robot.finger_values(fingers[step].sum(axis=1))
-            states[step][:, layout["object"]] = places[step]
-    reached = np.linalg.norm(places - goal, axis=2) <= success_distance_m
+            places_at(states[step], objects)[:] = each_object(places[step])
+    reached: BoolArray = np.all(distances(places, goal) <= success_distance_m, axis=-1)
     return RecordedEpisodes(states, goal, reached)

@@ -99,7 +99,7 @@ class SafeRobot:
     ) -> None:
         self.config, self._robot, self._poses, self._held, self._dry_run = config, robot, poses, held, dry_run
         self.limiter = SetPointLimiter(config.box(world), config.max_speed_m_s, config.max_acceleration_m_s2)
-        self._widest_m = config.widest_m(world)
+        self._widest_m, self._num_objects = config.widest_m(world), world.num_objects
         self.stopped: str | None = None
         """Why the robot was stopped; None while it was not."""
         self.width_m = np.nan
@@ -119,7 +119,7 @@ class SafeRobot:
             RobotError: it does not answer or answers too late, is outside its box (but for a dry run, which shows
                 where it is), the switch is not held, or the object is not seen.
         """
-        self._state_watch, self.object = StateWatch(self.config.watch), PoseWatch(self.config.watch)
+        self._state_watch, self.object = StateWatch(self.config.watch), PoseWatch(self.config.watch, self._num_objects)
         self.limiter.position_m = np.full(3, np.nan)  # nothing was commanded that the robot could be away from
         begin_s = self._robot.now_s()
         for _ in range(_NUM_TRIED):

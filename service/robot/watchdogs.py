@@ -18,6 +18,7 @@ from pydantic import Field
 from service.base.errors import TandemError
 from service.base.types import StateArray
 from service.config.frozen import FrozenModel
+from service.envs.observations import distances
 from service.robot.interface import ObjectPose, RobotState
 
 _CLOCKS_AGREE_S = 0.02
@@ -69,15 +70,15 @@ class StateWatch:
 
 
 class PoseWatch:
-    """Watches the object's poses, and keeps the last one that can be believed.
+    """Watches the poses of K objects, and keeps the last one that can be believed.
 
-    A pose that is missing (NaN) or jumps is passed over, and the one before it stands in for a while.
+    A pose in which one is missing (NaN) or jumps is passed over, and the one before it stands in for a while.
     """
 
-    def __init__(self, config: WatchConfig) -> None:
+    def __init__(self, config: WatchConfig, num_objects: int) -> None:
         self._config = config
-        self.position_m: StateArray = np.full(3, np.nan)
-        """(3,) the last position that can be believed; NaN before the first."""
+        self.position_m: StateArray = np.full(3 * num_objects, np.nan)
+        """(3 K,) the last positions that can be believed; NaN before the first."""
         self.time_s = -np.inf
         """When that was measured."""
         self._stamp_s, self._new_s = -np.inf, -np.inf
@@ -89,6 +90,9 @@ class PoseWatch:
         """Take a pose; what is wrong, if anything."""
         if not np.isfinite(pose.time_s) or pose.time_s - now_s > _CLOCKS_AGREE_S:
             return f"an object pose of {pose.time_s:.3f} s, at {now_s:.3f} s by the robot's clock: set the clocks alike"
+        if (shape := np.shape(pose.position_m)) != self.position_m.shape:
+            wanted = ", ".join(["x, y, z"] * (self.position_m.size // 3))
+            return f"an object pose of the shape {shape}, not {self.position_m.shape}: {wanted}"
         if pose.time_s > self._stamp_s:
             self._stamp_s, self._new_s = pose.time_s, now_s
             self._take(pose, now_s)
@@ -110,7 +114,7 @@ class PoseWatch:
             return
         self._missing_since_s = None
         if np.isfinite(self.time_s):
-            far_m = float(np.linalg.norm(pose.position_m - self.position_m))
+            far_m = float(distances(pose.position_m, self.position_m).max())
             if self._jumping_since_s is None:
                 self._gap_s = pose.time_s - self.time_s  # kept while it jumps, or in time any jump were slow enough
             if far_m > self._config.jump_allowance_m + self._config.max_object_speed_m_s * self._gap_s:

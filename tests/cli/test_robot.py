@@ -59,6 +59,26 @@ def test_goals_are_played_logged_and_drawn_from_the_log(tmp_path):
     assert_refused(again, "there is a file already; name another")
 
 
+def test_two_cubes_have_a_goal_each_and_are_drawn_where_they_were(tmp_path):
+    goal, log = "--goal=-0.1,0.05,0.2,0.05,-0.1,0.025", tmp_path / "log.jsonl"
+    two = ("--policy", "panda-two-cubes@champion", "--steps", 3)
+    ran = invoke("run", "--robot", "mujoco", goal, "--log", log, *two, *FAST)
+    assert ran.exit_code == 0, ran.output
+    assert "goal -0.100, 0.050, 0.200, 0.050, -0.100, 0.025: not reached" in ran.stdout
+    row = read_jsonl(log)[3]
+    world, drawn = read_log(log)
+    from service.envs.batch import WorldBatch
+
+    with WorldBatch(world, 1, num_threads=1) as worlds:
+        worlds.restore(drawn.states[2])
+        np.testing.assert_allclose(worlds.object_position[0], row["object_m"])
+    assert drawn.goal.shape == (1, 6)
+    assert_refused(
+        invoke("run", "--robot", "mujoco", goal.replace("0.025", "0.02"), *two),
+        "write one point, no lower than the object lies, 0.025 and 0.025 m",
+    )
+
+
 def test_a_dry_run_says_where_it_would_go_and_moves_nothing():
     ran = invoke("run", "--robot", "mujoco", "--dry-run", "--steps", 2, *FAST)
     assert ran.exit_code == 0, ran.output

@@ -14,7 +14,7 @@ from service.envs.observations import distances, each_object
 from service.envs.tasks import find_task
 from service.methods.task import _mixed
 from service.robot.play.game import Game
-from service.robot.running import for_robot
+from service.robot.pybullet_robot import PyBulletParameters, world_of
 from service.runs.train import open_run
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import TREE, write_yaml
@@ -114,8 +114,8 @@ def test_goals_are_typed_for_all(two):
 
 
 def test_who_knows_one_object_says_so(two):
-    with pytest.raises(TandemError, match=r"moves 2 objects; tandem robot knows one"):
-        for_robot(two)
+    with pytest.raises(TandemError, match=r"world\.objects: PyBullet has one cube only"):
+        world_of(two.world, PyBulletParameters())
     more = replace(find_task("push"), world={"objects": ["cube", "cube"]})
     with pytest.raises(TandemError, match="was trained in a world of 1 object, and Push has 2"):
         service.load().playing(more)

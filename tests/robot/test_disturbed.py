@@ -6,7 +6,7 @@ from service.config.world import WorldConfig
 from service.robot.backends import BackendConfig, connect, read_backend
 from service.robot.disturbed import DisturbanceConfig, DisturbedPoses, DisturbedRobot
 from service.robot.interface import Command
-from tests.robot.fakes import OBJECT_M, FakeRobot
+from tests.robot.fakes import HOME_M, OBJECT_M, FakeRobot
 
 
 def test_commands_and_states_come_as_late_as_asked():
@@ -45,6 +45,19 @@ def test_poses_are_late_noisy_and_off_alike_for_a_seed():
     np.testing.assert_allclose(places.std(axis=0), 0.005, rtol=0.05)
     np.testing.assert_array_equal(read(0, reads_per_tick=3)[0], places)  # a pose that is read again stays what it was
     assert (read(1)[0] != places).any()
+
+
+def test_two_objects_have_noise_of_their_own_and_the_same_offset():
+    robot = FakeRobot()
+    robot.poses.position_m = np.concatenate((OBJECT_M, HOME_M))
+    config = DisturbanceConfig(pose_noise_m=0.005, pose_offset_m=(0.01, 0.0, -0.02))
+    poses, found = DisturbedPoses(robot.poses, robot.now_s, config), []
+    for _ in range(2000):
+        robot.advance(0.004)
+        found.append(poses.read().position_m)
+    away = np.array(found) - robot.poses.position_m
+    np.testing.assert_allclose(away.mean(axis=0), [0.01, 0.0, -0.02] * 2, atol=5e-4)
+    assert np.abs(np.corrcoef(away.T) - np.eye(6)).max() < 0.1
 
 
 def test_a_new_start_knows_nothing_of_the_episode_before():

@@ -5,6 +5,8 @@ from service.base.errors import RobotError, TandemError
 from service.config import WorldConfig
 from service.config.robot import read_robot
 from service.envs.batch import WorldBatch
+from service.registry.bundled import BUNDLED
+from service.registry.loading import load
 from service.robot.backends import ExactPoses
 from service.robot.calibrate import Calibration, read_calibration, write_calibration
 from service.robot.interface import Command
@@ -37,6 +39,26 @@ def test_without_bounds_the_bridge_plays_what_the_evaluator_plays(champion):
     np.testing.assert_allclose([row["effector_m"] for row in rows[:6]], paths[:6], atol=1e-4)
     assert near < 0.05
     assert np.linalg.norm(robot.object_position() - goal[0]) < 0.05
+
+
+def test_two_cubes_are_played_as_the_evaluator_plays_them():
+    """The observations and actions of both, in a place each; and a log of it shows them where they were."""
+    policy = load("panda-two-cubes@champion", BUNDLED)
+    world, goal = policy.world, np.array([[-0.1, 0.05, 0.2, 0.05, -0.1, 0.025]])
+    with WorldBatch(world, 1) as worlds:
+        worlds.reset(np.random.default_rng(5))
+        start = worlds.object_position[0].copy()
+        robot = connect(world, {}).robot
+        robot.reset(start)
+        np.testing.assert_allclose(robot.object_position(), start, atol=1e-9)
+        rows, paths = [], []
+        away = Bridge(policy.policy, robot, ExactPoses(robot, robot), world, JUMPS, record=rows.append).run(goal[0], 5)
+        for _ in range(5):
+            paths.append(worlds.ee_position[0].copy())
+            worlds.step(policy.policy.act_deterministic(np.hstack([worlds.positions(), goal]).astype(np.float32)))
+    np.testing.assert_allclose([row["effector_m"] for row in rows[:4]], paths[:4], atol=1e-4)  # then it touches
+    last = robot.object_position().reshape(2, 3)
+    assert away == pytest.approx(np.linalg.norm(last - goal.reshape(2, 3), axis=1).max(), abs=0.01)
 
 
 def test_the_champion_reaches_goals_within_the_bounds_of_a_franka(champion):

@@ -1,9 +1,11 @@
 import os
 
+import numpy as np
 import pytest
 
 from service.base.errors import TandemError
 from service.robot import watchdogs
+from service.robot.interface import ObjectPose
 
 
 def test_a_key_counts_while_it_repeats(monkeypatch):
@@ -41,3 +43,22 @@ def test_without_a_terminal_there_is_no_key():
         watchdogs.HeldKey(reading)
     os.close(reading)
     os.close(writing)
+
+
+def test_each_of_two_objects_is_watched():
+    """3 m/s and 5 cm are allowed in 40 ms: 17 cm, of either."""
+    first, second = np.array([0.0, 0.1, 0.025]), np.array([0.1, 0.0, 0.025])
+
+    def seen(place, other):
+        watch = watchdogs.PoseWatch(watchdogs.WatchConfig(), 2)
+        assert watch.check(ObjectPose(0.0, np.concatenate((first, second))), 0.0) is None
+        assert watch.check(ObjectPose(0.04, np.concatenate((place, other))), 0.04) is None  # one may still stand in
+        return watch.position_m
+
+    near, far = np.array([0.16, 0.0, 0.0]), np.array([0.18, 0.0, 0.0])
+    np.testing.assert_array_equal(seen(first + near, second + near), [*(first + near), *(second + near)])
+    np.testing.assert_array_equal(seen(first, second + far), [*first, *second])
+    np.testing.assert_array_equal(seen(first + far, second), [*first, *second])
+    np.testing.assert_array_equal(seen(first + near, np.full(3, np.nan)), [*first, *second])
+    fault = watchdogs.PoseWatch(watchdogs.WatchConfig(), 2).check(ObjectPose(0.0, first), 0.0)
+    assert fault == "an object pose of the shape (3,), not (6,): x, y, z, x, y, z"
