@@ -77,7 +77,7 @@ def report(result: Mapping[str, Any]) -> str:
         lines.append(f"| {run['seed']} | {cells}|")
     median_s = statistics.median(times_s(result))
     if math.isfinite(median_s):
-        lines += ["", f"Median: {median_s / 60:.1f} minutes; a seed that was not there counts as one that never is."]
+        lines += ["", f"Median: {median_s / 60:.1f} minutes; a seed that did not reach it counts as infinite."]
     return "\n".join(lines)
 
 

@@ -47,16 +47,20 @@ def longer_table(results: Sequence[Result], longer: Sequence[Result], more_updat
     """Success after the env steps of the table and after those of longer trials, where there are such, of equal seeds.
 
     Where each of these seeds was ``GOOD``, by the mean of two evaluations in a row, the cell says from when on.
-    ``more_updates`` are longer trials with ``MANY_UPDATES`` of the learner for every 64 env steps.
+    ``more_updates`` are longer trials with ``MANY_UPDATES`` of the learner for every 64 env steps; the table has none.
     """
     tasks = [task for task in PAPERS if any(each[TRIAL]["task"] == task for each in (*longer, *more_updates))]
-    of, rows = by_method_and_task(results), list[Row]()
-    for words, trials in (("", longer), (f", {MANY_UPDATES} updates for 64 env steps", more_updates)):
-        of_longer = by_method_and_task(trials)
+    of, of_longer, of_many = (by_method_and_task(trials) for trials in (results, longer, more_updates))
+    with_many, rows = f", {MANY_UPDATES} updates for 64 env steps", list[Row]()
+    for words, trials in (("", of_longer), (with_many, of_many)):
         for method in METHODS:
-            pairs = [(of.get((method, task), []), of_longer.get((method, task), [])) for task in tasks]
-            if any(after for _, after in pairs):
-                rows.append((METHODS[method].title + words, *(_from_to(*pair) for pair in pairs)))
+            places = [(method, task) for task in tasks]
+            if any(place in trials for place in places):
+                cells = (
+                    _after(trials.get(place, []), of.get(place, []) if trials is of_longer else None)
+                    for place in places
+                )
+                rows.append((METHODS[method].title + words, *cells))
     return table(("", *(find_task(task).title for task in tasks)), rows)
 
 
@@ -113,17 +117,21 @@ def _missing(group: Sequence[Experiment]) -> str:
     )
 
 
-def _from_to(before: Seeds, after: Seeds) -> str:
-    seeds = {each[TRIAL]["seed"] for each in after}
-    alike = [each for each in before if each[TRIAL]["seed"] in seeds]
-    if alike:
-        known = {each[TRIAL]["seed"] for each in alike}
-        after = [each for each in after if each[TRIAL]["seed"] in known]
+def _after(after: Seeds, before: Seeds | None) -> str:
+    """Success after, and what it was before, of equal seeds; None: it says nothing of before."""
+    begun = ""
+    if before is not None:
+        seeds = {each[TRIAL]["seed"] for each in after}
+        alike = [each for each in before if each[TRIAL]["seed"] in seeds]
+        if alike:
+            known = {each[TRIAL]["seed"] for each in alike}
+            after = [each for each in after if each[TRIAL]["seed"] in known]
+        begun = f"{_mean(alike)} to "
     if not after:
         return ""
     good = mean_until(after, GOOD)
     when = "" if good is None else f", {percent(GOOD)} after {millions(good)}"
-    return f"{_mean(alike)} to {_mean(after)} ({len(after)}){when}"
+    return f"{begun}{_mean(after)} ({len(after)}){when}"
 
 
 def _compared(title: str, method: str, of: Mapping[tuple[str, str], list[Result]]) -> Row:
@@ -172,7 +180,7 @@ def headline_table(results: Sequence[Result]) -> str:
     rows: list[Row] = []
     for title, names in groups.items():
         if found := [name for name in names if name in known]:
-            words = f"{title}, the best of up to {len(found)} on each task"
+            words = f"{title}, the best of up to {len(found)} methods on each task"
             if len(found) == 1:
                 words = title if len(names) == 1 else f"{title}: {METHODS[found[0]].title}"
             rows.append(

@@ -119,7 +119,7 @@ def seeds_words(study: Mapping[str, Any]) -> str:
     """The same in a sentence for the README."""
     asked = percent(ASKED_RATES["mixed"])
     return (
-        f"So many runs solve {asked} of random goals or more (no setting was tuned on their seeds):\n"
+        f"Runs that solve {asked} of random goals or more (no setting was tuned on their seeds):\n"
         f"{_how_many(study)} env steps ([each seed](docs/results/pretraining.md#every-seed))."
     )
 
@@ -165,9 +165,9 @@ def why_alice_words(studies: Mapping[str, Mapping[str, Any]]) -> str:
     return (
         f"[Why Alice](docs/results/pretraining.md#why-alice)? Of random goals Bob solves {mean['recipe']}; "
         f"{mean['no-cloning']} if he clones none of her turns, "
-        f"{mean['no-difficulty']} if his misses earn her nothing."
-        f"\nIf he also practises goals of the whole workspace: {mean['uniform']} beside her, "
-        f"{mean['uniform-new-alice']} if she never learns, {mean['uniform-alone']} without her."
+        f"{mean['no-difficulty']} if she is not paid when he fails."
+        f"\nIf he also plays random goals of the whole workspace: {mean['uniform']} with Alice, "
+        f"{mean['uniform-new-alice']} with an Alice who never learns, {mean['uniform-alone']} without Alice."
     )
 
 
