@@ -92,7 +92,7 @@ def test_the_table_of_seeds_by_hand():
         "At least 93 % of one, 80 % of table, 60 % of air goals: 0 of 1 at 2 M, 1 of 1 at 5 M env steps.",
     ]
     words = seeds_words({"runs": runs})
-    assert words.startswith("So many runs solve 95 % of random goals or more (")
+    assert words.startswith("Runs that solve 95 % of random goals or more (")
     assert "):\n1 of 2 at 2 M, 1 of 1 at 5 M env steps (" in words
     for run, day in zip(runs, (27, 28), strict=True):
         run |= {"git_commit": "fb14796" + 33 * "0", "machine": {"time": f"2026-11-{day}T08:00:00"}}
@@ -114,8 +114,8 @@ def test_what_alice_is_for_by_hand():
     assert len(lines) == 4
     assert why_alice_words(some) == ""
     words = why_alice_words(dict.fromkeys(ARMS, study(0.1, 0.2)) | some)
-    assert "solves 96 %; 50 % if he clones none of her turns, 15 % if his misses earn her nothing" in words
-    assert "15 % beside her, 15 % if she never learns, 15 % without her" in words
+    assert "solves 96 %; 50 % if he clones none of her turns, 15 % if she is not paid when he fails" in words
+    assert "15 % with Alice, 15 % with an Alice who never learns, 15 % without Alice" in words
 
 
 @pytest.mark.parametrize("name", ARMS)
