@@ -20,7 +20,7 @@ from benchmarks.report.markdown import measured_on, percent, table
 from service.actors.evaluation import evaluate, wilson_interval
 from service.base.errors import RobotError
 from service.base.types import BoolArray, StateArray
-from service.envs.sampling import draw_goals, draw_objects
+from service.envs.sampling import draw_first, draw_goals
 from service.registry.loading import Trained, load
 from service.robot.backends import Backend, BackendConfig, Simulator, connect
 from service.robot.calibrate import Calibration, calibrate
@@ -172,7 +172,7 @@ def play_chunk(row: Row, chunk: int, settings: Settings, gain: Gain) -> list[Pla
 def draw_episodes(policy: Trained, settings: Settings) -> tuple[StateArray, StateArray]:
     """(N, 3) places of the object at first, and (N, 3) goals, metres: the same as of an evaluation in MuJoCo."""
     rng = np.random.default_rng(settings.seed)
-    places = draw_objects(rng, settings.num_goals, policy.world)
+    places = draw_first(rng, settings.num_goals, policy.world)
     return places.object, draw_goals(policy.goal_kind, rng, policy.world, policy.success_distance_m, places)
 
 

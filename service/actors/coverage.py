@@ -47,7 +47,7 @@ def skill_trajectories(
     Weights are uniform in (0, 1]; actions are sampled from the composition.
 
     Returns:
-        (num_skills, num_steps + 1, 3) metres, each from a fresh reset.
+        (K num_skills, num_steps + 1, 3) metres, each from a fresh reset.
     """
     rng = np.random.default_rng(seed)
     weights = (1.0 - rng.random((num_skills, primitives.num_primitives))).astype(np.float32)

@@ -35,7 +35,7 @@ class DeterministicPolicy(Protocol):
     """A policy that acts without noise."""
 
     def act_deterministic(self, observation: FloatArray) -> FloatArray:
-        """(N, 14) Bob's input to actions (N, 4)."""
+        """(N, O) Bob's input to actions (N, 4)."""
 
 
 class IdlePolicy:

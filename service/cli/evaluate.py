@@ -308,9 +308,9 @@ def parse_points(option: str, text: str, world: WorldConfig, expected: str) -> S
         expected: words for what can be typed, up to its form.
 
     Raises:
-        TandemError: no points; or one outside of the workspace, or inside a fixture.
+        TandemError: no points; or one outside of the workspace, inside a fixture, or of objects inside each other.
     """
-    from service.envs.sampling import inside_fixtures
+    from service.envs.sampling import inside_each_other, inside_fixtures
 
     try:
         points = np.array([[float(part) for part in point.split(",")] for point in text.strip("; ").split(";")])
@@ -326,6 +326,8 @@ def parse_points(option: str, text: str, world: WorldConfig, expected: str) -> S
         )
     for point in points[inside_fixtures(points, world)]:
         raise TandemError(
-            f"{option}: at {in_metres(point)} the object would be inside a fixture, or the upright box around it"
+            f"{option}: at {in_metres(point)} an object would be inside a fixture, or the upright box around it"
         )
+    for point in points[inside_each_other(points, world)]:
+        raise TandemError(f"{option}: at {in_metres(point)} objects would be inside each other")
     return points

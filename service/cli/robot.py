@@ -89,7 +89,7 @@ def run(
                 _print_step(row, bridge.safe.limiter.box, to_stderr=as_json)
 
         def ready(episode: int, goal_m: StateArray) -> None:
-            wait(f"goal {episode + 1} of {episodes}, {in_metres(goal_m)}: put arm and object to their start")
+            wait(f"goal {episode + 1} of {episodes}, {in_metres(goal_m)}: put arm and objects to their start")
 
         bridge = Bridge(
             player.policy, backend.robot, backend.poses, player.world, config,
@@ -175,7 +175,7 @@ def parse_goal(text: str, world: WorldConfig) -> StateArray:
     goals = parse_points("--goal", text, world, "a point")
     if len(goals) > 1 or (each_object(goals[0])[:, 2] < np.round(world.rest_heights_m, 6)).any():
         lowest = " and ".join(f"{height_m:.3f}" for height_m in world.rest_heights_m)
-        raise TandemError(f"--goal {text}: write one point, no lower than the object lies, {lowest} m")
+        raise TandemError(f"--goal {text}: write one point, no lower than each object lies, {lowest} m")
     goal: StateArray = goals[0]
     return goal
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import cycle
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -81,8 +82,10 @@ class RandomisationConfig(FrozenModel):
         32, ge=1, le=1024, description="in the bank; more cover the ranges more densely, and 64 cost 5 % of throughput"
     )
     object_size: Range | None = Field(None, description="factor of all sizes of the object")
-    object_mass_kg: Range | None = Field(None)
-    friction: Range | None = Field(None, description="sliding friction of the object, also on the table")
+    object_mass_kg: Range | None = Field(None, description="of several objects those that are only named")
+    friction: Range | None = Field(
+        None, description="sliding friction of the object, also on the table; of several those that are only named"
+    )
     gain: Range | None = Field(None, description="factor of the stiffness of the arm's servos")
     damping: Range | None = Field(
         None, description="factor of their damping; of the Panda's 0.4 to 1.7 cover 100 to 40 % of a step of 5 cm"
@@ -139,8 +142,8 @@ class WorldConfig(FrozenModel):
     objects: tuple[ObjectWithMass, ...] = Field(
         (),
         max_length=len(COLORS),
-        description="in place of object, several that each have a goal: cube, sphere, or a description with mass_kg "
-        "and friction (docs/objects.md)",
+        description="in place of object, several that each have a goal: cube, sphere, or a description, also of its "
+        "mass_kg and friction (docs/objects.md)",
     )
     object_size_m: float = Field(
         0.05, ge=0.02, le=0.07, description="cube edge or sphere diameter; paper: 5 cm. A description has its own"
@@ -175,10 +178,20 @@ class WorldConfig(FrozenModel):
     @model_validator(mode="before")
     @classmethod
     def _one_object_is_the_list_of_one(cls, values: Any) -> Any:
+        """And of several what a description leaves out is as of one that is only named."""
         objects = values.get("objects") if isinstance(values, Mapping) else None
-        if not isinstance(objects, list | tuple) or len(objects) != 1 or values.get("object", "cube") != "cube":
+        if not isinstance(objects, list | tuple) or values.get("object", "cube") != "cube":
             return values
-        (only,), rest = objects, {key: value for key, value in values.items() if key != "objects"}
+        rest = {key: value for key, value in values.items() if key != "objects"}
+        if len(objects) != 1:
+            names = {"mass_kg": "object_mass_kg", "friction": "friction"}
+            usual = {key: values.get(name, cls.model_fields[name].default) for key, name in names.items()}
+            filled = [
+                {**usual, "color": color, **each} if isinstance(each, Mapping) else each
+                for each, color in zip(objects, cycle(COLORS), strict=False)
+            ]
+            return {**rest, "objects": filled}
+        (only,) = objects
         if isinstance(only, ObstacleConfig):
             only = only.model_dump()
         if not isinstance(only, Mapping):

@@ -19,7 +19,7 @@ from service.envs.reach import reach_of
 from service.envs.robot import Robot, described
 from service.envs.sampling import Places, draw_starts, gripper_boxes, inside_gripper_or_table, join
 from service.envs.scene import FIXTURE_PREFIX, build_layout
-from service.envs.state_layout import OBSTACLE_PREFIX, obstacle_columns, places_at, pose_columns
+from service.envs.state_layout import OBSTACLE_PREFIX, object_columns, obstacle_columns, places_at
 
 DISPLACEMENT_M = 0.05
 """Way from the end effector to its set-point that a full action asks for (paper); in a step the arm covers a part of
@@ -80,7 +80,7 @@ class WorldBatch:
         """Columns of ``states``."""
         self._commands = self.layout["commands"]
         self._names = object_names(config)
-        self._objects = pose_columns(self.layout, "object", config.num_objects)
+        self._objects = object_columns(self.layout, config.num_objects)
         self._obstacles = obstacle_columns(self.layout, len(config.obstacles))
         self._num_commands = self._commands.stop - self._commands.start
         # The weights of objects and obstacles are actuators, too, the last ones, which ignore their control.
@@ -131,7 +131,7 @@ class WorldBatch:
     def rest_heights(self) -> StateArray:
         """(N, K) height of each object's centre as it lies on the table of its world, metres."""
         model = self.states[:, self.layout["model"]].sum(axis=1)  # 0 where there is but one, and no such column
-        heights: StateArray = self.bank.rest_height_m[model.astype(np.intp)]
+        heights: StateArray = self.bank.rest_heights_m[model.astype(np.intp)]
         return heights
 
     @property
@@ -163,7 +163,7 @@ class WorldBatch:
         """(num, S) states in which games and episodes start.
 
         The arm is at home, the gripper open unless it is blocked, the object anywhere on the table inside the
-        workspace, and so are obstacles. Beside a wall or a box the object is where ``sampling.draw_objects`` says, and
+        workspace, and so are obstacles. Beside a wall or a box the object is where ``sampling.draw_first`` says, and
         a box is anywhere.
         """
         states = np.tile(self._fresh_state, (num, 1))
@@ -186,7 +186,7 @@ class WorldBatch:
         if drawn.model_ranges:
             model = rng.integers(len(self.bank), size=num)
             states[:, layout["model"]] = model[:, None]
-            places_at(states, self._objects)[:, :, 2] += self.bank.rest_height_m[model] - self.config.rest_heights_m
+            places_at(states, self._objects)[:, :, 2] += self.bank.rest_heights_m[model] - self.config.rest_heights_m
             places_at(states, self._obstacles)[:, :, 2] += self.bank.table_height_m[model][:, None]
             if self.config.fixture == "box":
                 states[:, layout["box_place"].start + 2] += self.bank.table_height_m[model]

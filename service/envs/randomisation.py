@@ -46,7 +46,7 @@ class ModelBank:
         """M of them."""
         self.table_height_m: StateArray = self.drawn.get("table_height_m", np.zeros(num))
         """(M,) above where the configuration has it."""
-        self.rest_height_m: StateArray = self.table_height_m[:, None] + [each.rest_heights_m for each in variants]
+        self.rest_heights_m: StateArray = self.table_height_m[:, None] + [each.rest_heights_m for each in variants]
         """(M, K) height of each object's centre as it lies on the table."""
 
     def __len__(self) -> int:

@@ -222,7 +222,7 @@ def _check_effector(spec: mujoco.MjSpec, robot: RobotConfig, config: WorldConfig
     width_m = max(body.extent_m[1] for body in config.bodies)
     if config.gripper == "free" and width_m >= robot.opening_m:
         raise ConfigError(
-            f"robot {robot.name}: its gripper opens to {robot.opening_m:g} m, and along y the object is {width_m:g} m "
+            f"robot {robot.name}: its gripper opens to {robot.opening_m:g} m, and along y an object is {width_m:g} m "
             "wide: make it smaller, turn it, or set world.gripper=blocked"
         )
 

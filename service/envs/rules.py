@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.base.errors import ConfigError
 from service.base.types import Array, BoolArray, StateArray
 from service.base.user_code import CodeError, checked, naming_errors_of, place_of, shown
 from service.config.run import SUCCESS_DISTANCE_M
@@ -47,6 +48,11 @@ class Rules:
             raise CodeError(self.task.closed)
         if isinstance(self.task.goals, str):
             check_goals(self.task.goals, worlds.config)
+        if self.task.starts is not None and worlds.config.num_objects > 1 and "object_size" in worlds.bank.drawn:
+            raise ConfigError(
+                f"{self.task.title}: its starts know objects of one size, and world.randomisation.object_size draws "
+                "others: leave that out"
+            )
         self._worlds, self._near_m = worlds, success_distance_m
         self.elapsed: NDArray[np.int64] = np.zeros(worlds.num_worlds, dtype=np.int64)
         """(N,) steps of the episode so far."""

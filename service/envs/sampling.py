@@ -72,7 +72,7 @@ def sample_on_table(
     return position
 
 
-def draw_objects(rng: np.random.Generator, num: int, config: WorldConfig) -> Places:
+def draw_first(rng: np.random.Generator, num: int, config: WorldConfig) -> Places:
     """Random starts of the first object, and of the box where there is one; all else is left out.
 
     Without a fixture, anywhere on the table inside the workspace; so far from fixtures that are described that an open
@@ -92,38 +92,39 @@ def draw_objects(rng: np.random.Generator, num: int, config: WorldConfig) -> Pla
 
 
 def draw_starts(rng: np.random.Generator, num: int, config: WorldConfig, gripper: Boxes) -> Places:
-    """Random places of what starts elsewhere in every game: see ``draw_objects`` for the first object and the box.
+    """Random places of what starts elsewhere in every game: see ``draw_first`` for the first object and the box.
 
     The other objects and obstacles lie on the table with their centres inside the workspace, clear of fixtures, the
-    box, the gripper and each other, and so far from objects that an open finger fits between. Where some find no place,
-    the first object and the box are drawn anew, too.
+    box, the gripper and each other; an open finger fits between objects and what is beside them. Where some find no
+    place, the first object and the box are drawn anew, too.
 
     Raises:
         ConfigError: there is no room.
     """
     others = (*config.bodies[1:], *config.obstacles)
-    first, box, _ = draw_objects(rng, num, config)
-    standing, beside = join(_around_fixtures(config), gripper), np.empty((num, len(others), 3))
+    first, box, _ = draw_first(rng, num, config)
+    beside = np.empty((num, len(others), 3))
     left = np.arange(num)
     for _ in range(_NUM_ARRANGEMENTS):
         clear = ~_overlap(_around(first[left], config.shape), gripper)
         if others:
-            beside[left], found_place = _place_others(rng, first[left], box[left], others, config, standing)
+            beside[left], found_place = _place_others(rng, first[left], box[left], others, config, gripper)
             clear &= found_place
         left = left[~clear]
         if not left.size:
             further = beside[:, : config.num_objects - 1].reshape(num, 3 * (config.num_objects - 1))
             return Places(np.concatenate([first, further], axis=1), box, beside[:, config.num_objects - 1 :])
-        first[left], box[left], _ = draw_objects(rng, left.size, config)
+        first[left], box[left], _ = draw_first(rng, left.size, config)
     if not others:
         raise ConfigError(
             f"world.object is {config.shape.extent_m[2]:g} m high and starts inside the gripper, wherever it is put: "
             f"raise world.start_height_m, which is {config.start_height_m:g}"
         )
-    name = "obstacles" if config.num_objects == 1 else "objects"
+    things = [("object", config.num_objects), ("obstacle", len(config.obstacles))]
+    there = " and ".join(f"{many} {name}{'s' * (many > 1)}" for name, many in things if many)
     raise ConfigError(
-        f"world.{name}: no room in the workspace for the {len(others)} of them beside the first object, each other, "
-        "fixtures and the gripper: leave some out, make them smaller, or make world.workspace larger"
+        f"world.workspace: no room in it for {there} beside each other, fixtures and the gripper: leave some out, make "
+        "them smaller, raise world.start_height_m, or make the workspace larger"
     )
 
 
@@ -133,10 +134,10 @@ def _place_others(
     box: StateArray,
     others: Sequence[ObjectConfig],
     config: WorldConfig,
-    standing: Boxes,
+    gripper: Boxes,
 ) -> tuple[StateArray, BoolArray]:
     """(N, M, 3) random places of all things but the first object and the box; (N,) worlds where all are clear."""
-    num = len(first)
+    num, fixtures = len(first), _around_fixtures(config)
     places, all_clear = np.empty((num, len(others), 3)), np.ones(num, dtype=bool)
     taken = [_beside(_around(first, config.shape))]
     if box.size:
@@ -150,7 +151,9 @@ def _place_others(
             here[blocked] = sample_on_table(rng, int(blocked.sum()), config.workspace, thing.extent_m[2])
             around = _around(here, thing)
             beside = Boxes(around.lower - scene.GAP_M, around.upper + scene.GAP_M)
-            blocked = _overlap(beside, standing) | _overlap(beside, lying)
+            room_m = _BESIDE_OBJECT_M if index < config.num_objects - 1 else scene.GAP_M
+            apart_from = Boxes(around.lower - room_m, around.upper + room_m)
+            blocked = _overlap(beside, gripper) | _overlap(apart_from, fixtures) | _overlap(beside, lying)
             if not blocked.any():
                 break
         all_clear &= ~blocked

@@ -1,4 +1,4 @@
-"""The scene: a robot at a table with one rigid object, obstacles, and a fixture where a task wants one.
+"""The scene: a robot at a table with rigid objects, obstacles, and a fixture where a task wants one.
 
 A fixture, a wall across the workspace or an open box, cannot be moved. The wall is part of the table; the box is
 elsewhere in every world, so its place is part of a world's state. Both are touched by the object, the hand and the

@@ -56,15 +56,19 @@ class StateLayout:
         return self._columns[name]
 
 
-def pose_columns(layout: StateLayout, first: str, num: int) -> slice:
-    """Columns of a state that hold poses of ``num`` things, of which the first has that name."""
-    start = layout[first].start if num else 0
-    return slice(start, start + _COLUMNS_EACH * num)
+def object_columns(layout: StateLayout, num: int) -> slice:
+    """Columns of a state that hold poses of ``num`` objects."""
+    return _pose_columns(layout, "object", num)
 
 
 def obstacle_columns(layout: StateLayout, num: int) -> slice:
     """Columns of a state that hold poses of ``num`` obstacles."""
-    return pose_columns(layout, f"{OBSTACLE_PREFIX}1", num)
+    return _pose_columns(layout, f"{OBSTACLE_PREFIX}1", num)
+
+
+def _pose_columns(layout: StateLayout, first: str, num: int) -> slice:
+    start = layout[first].start if num else 0
+    return slice(start, start + _COLUMNS_EACH * num)
 
 
 def places_at(states: StateArray, columns: slice) -> StateArray:

@@ -137,6 +137,10 @@ def describe(
             }
             for body in world.bodies
         ],
+        "obstacles": [  # that start elsewhere in every episode
+            {"shape": each.shape, "extent_m": each.extent_m, "mass_kg": each.mass_kg, "friction": each.friction}
+            for each in world.obstacles
+        ],
         "fixtures": fixtures,  # that are the same in every episode; the box of the task box is elsewhere in each
         "success_distance_m": trained.success_distance_m,
         "measured": measured,
@@ -428,7 +432,8 @@ def _things(objects: Sequence[Mapping[str, Any]]) -> str:
     words = []
     for number, one in enumerate(objects, 1):
         size = " x ".join(f"{1e3 * each:g}" for each in one["extent_m"])
-        words.append(f"{_which(number, len(objects))} is a {one['shape']} of {size} mm and {one['mass_kg']:g} kg")
+        shape = f"{'an' if one['shape'] == 'ellipsoid' else 'a'} {one['shape']}"
+        words.append(f"{_which(number, len(objects))} is {shape} of {size} mm and {one['mass_kg']:g} kg")
     said = ", ".join(words)
     return said[0].upper() + said[1:]
 

@@ -16,7 +16,7 @@ from service.base.user_code import CodeError, checked, find_class, naming_errors
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
 from service.envs.observations import each_object
-from service.envs.sampling import GoalKind, check_goals, sample_goals
+from service.envs.sampling import GoalKind, check_goals, inside_each_other, sample_goals
 from service.generator.validity import in_workspace
 
 NUM_DRAWN = 1024
@@ -73,14 +73,13 @@ class CheckedSource:
             self._source = kind()
 
     def goals(self, rng: np.random.Generator) -> StateArray:
-        """(M, 3 K) goals in the workspace, metres."""
+        """(M, 3 K) goals in the workspace, in which no object is inside another, metres."""
         with naming_errors_of(self._origin):
             goal = np.asarray(self._source.goals(self._known, rng))
         shape = len(np.atleast_1d(goal)), self._known.world.num_objects, 3
         goal = checked(f"{self._origin}: {self._name}.goals", goal, shape)
-        inside = in_workspace(goal, self._known.world.workspace).all(axis=1)
-        kept: StateArray = goal[inside].reshape(-1, shape[1] * 3)
-        return kept
+        kept: StateArray = goal[in_workspace(goal, self._known.world.workspace).all(axis=1)].reshape(-1, shape[1] * 3)
+        return kept[~inside_each_other(kept, self._known.world)]
 
     def weights(self, goal: StateArray, start: StateArray, learnability: StateArray) -> StateArray:
         """(M,) weights of tasks with (M, 3 K) goals and starts."""

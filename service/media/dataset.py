@@ -80,7 +80,7 @@ def write_dataset(name: str, played: Sequence[Played], config: Config, label: st
     """Write a Minari data set into the directory MINARI_DATASETS_PATH, or Minari's own; each turn is an episode.
 
     Observations are those of ``TabletopEnv``: ``observation`` (T + 1, P), ``achieved_goal`` and ``desired_goal``
-    (T + 1, 3). Rewards (T) are 1 where the object is within the success distance after a step, else 0;
+    (T + 1, 3 K). Rewards (T) are 1 where each object is within the success distance after a step, else 0;
     ``infos["is_success"]`` (T + 1) is the same with the start, ``infos["is_alice"]`` says whose turn it was. All end
     by time.
 

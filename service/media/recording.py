@@ -66,7 +66,7 @@ class RecordedEpisodes:
     goal: StateArray | None
     """(N, 3 K) metres; None for skills, which have no goal."""
     reached: BoolArray
-    """(T + 1, N) the object is within the success distance."""
+    """(T + 1, N) each object is within the success distance, or a task's success."""
     actions: FloatArray | None = None
     """(T, N, 4); None where they were not kept."""
 

@@ -39,7 +39,7 @@ GOAL_PAUSE_S, END_PAUSE_S = 0.4, 0.8
 _PAPER, _INK, _FAINT = (248, 248, 248), (34, 34, 34), (140, 140, 140)
 _BLUE, _ORANGE, _GREEN = (0, 114, 178), (213, 94, 0), (0, 138, 100)
 _NO_GOAL = {
-    Verdict.NOT_MOVED: "the object hardly moved",
+    Verdict.NOT_MOVED: "nothing was moved far",
     Verdict.OUTSIDE: "it left the workspace",
     Verdict.FALLEN: "it fell off the table",
 }

@@ -140,5 +140,5 @@ def connect(config: BackendConfig, world: WorldConfig, *, seed: int = 0) -> Back
         )
     if config.disturbance == DisturbanceConfig():
         return made
-    poses = DisturbedPoses(made.poses, made.robot.now_s, config.disturbance, seed=seed)
+    poses = DisturbedPoses(made.poses, made.robot.now_s, config.disturbance, num_objects=world.num_objects, seed=seed)
     return replace(made, robot=DisturbedRobot(made.robot, config.disturbance), poses=poses)

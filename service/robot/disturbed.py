@@ -95,23 +95,33 @@ class DisturbedPoses:
         poses: what really sees the object.
         now_s: the robot's clock.
         config: how much.
+        num_objects: K that are seen.
         seed: of the noise, which depends on nothing but the number of different poses that were read.
     """
 
     def __init__(
-        self, poses: PoseSource, now_s: Callable[[], float], config: DisturbanceConfig, *, seed: int = 0
+        self,
+        poses: PoseSource,
+        now_s: Callable[[], float],
+        config: DisturbanceConfig,
+        *,
+        num_objects: int = 1,
+        seed: int = 0,
     ) -> None:
-        self._poses, self._now_s, self._config = poses, now_s, config
+        self._poses, self._now_s, self._config, self._size = poses, now_s, config, 3 * num_objects
         self._rng = np.random.default_rng(seed)
         self._seen: deque[ObjectPose] = deque()
 
     def read(self) -> ObjectPose:
         """The objects as they were ``pose_delay_s`` ago, each with noise and offset."""
         pose = self._poses.read()
+        if pose is None or np.shape(pose.position_m) != (self._size,):
+            return pose  # what is wrong with it is the watchdog's to say
         if not self._seen or pose.time_s != self._seen[-1].time_s:
-            size, offset = len(pose.position_m), np.tile(self._config.pose_offset_m, len(pose.position_m) // 3)
-            noise = self._rng.normal(0.0, self._config.pose_noise_m, size) if self._config.pose_noise_m else 0.0
-            self._seen.append(replace(pose, position_m=pose.position_m + offset + noise))
+            offset = np.tile(self._config.pose_offset_m, self._size // 3)
+            noise = self._rng.normal(0.0, self._config.pose_noise_m, self._size) if self._config.pose_noise_m else 0.0
+            place = np.asarray(pose.position_m, dtype=np.float64)  # None becomes NaN
+            self._seen.append(replace(pose, position_m=place + offset + noise))
         return _as_of(self._now_s() - self._config.pose_delay_s, self._seen)
 
     def forget(self) -> None:

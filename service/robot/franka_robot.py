@@ -239,9 +239,12 @@ class Hand:
 class NoPoses:
     """A pose source that sees nothing: enough to calibrate, and a policy is stopped before it moves."""
 
+    def __init__(self, num_objects: int) -> None:
+        self._nowhere = np.full(3 * num_objects, np.nan)
+
     def read(self) -> ObjectPose:
         """Return a pose of now that was not seen."""
-        return ObjectPose(time.monotonic(), np.full(3, np.nan))
+        return ObjectPose(time.monotonic(), self._nowhere)
 
     def close(self) -> None:
         """Do nothing."""
@@ -261,13 +264,13 @@ def connect(world: WorldConfig, parameters: Mapping[str, Any]) -> Backend:
     given = FrankaParameters.model_validate(parameters)
     with needs_extra("franka", "robot franka"):
         franky = importlib.import_module("franky")
-    poses = _pose_source(given)
+    poses = _pose_source(given, world.num_objects)
     return Backend(FrankaRobot(franky, given), poses)
 
 
-def _pose_source(given: FrankaParameters) -> PoseSource:
+def _pose_source(given: FrankaParameters, num_objects: int) -> PoseSource:
     if given.poses is None:
-        return NoPoses()
+        return NoPoses(num_objects)
     module, _, name = given.poses.partition(":")
     try:
         source: PoseSource = getattr(importlib.import_module(module), name)(**given.pose_parameters)

@@ -15,7 +15,7 @@ from service.config.frozen import FrozenModel
 from service.config.world import WorldConfig
 from service.envs.batch import MAX_SPEED, MAX_TURN_RAD, WorldBatch
 from service.envs.observations import each_object
-from service.envs.state_layout import places_at, pose_columns
+from service.envs.state_layout import object_columns, places_at
 from service.robot.backends import Backend, ExactPoses
 from service.robot.interface import Command, RobotState
 
@@ -34,8 +34,8 @@ class MujocoParameters(FrozenModel):
         "by the speed of the set-points, as the controllers of real arms do; for set-points without jumps",
     )
     joint_friction_nm: float = Field(0.0, ge=0.0, le=20.0, description="dry friction of the arm's joints")
-    object_mass_kg: float | None = Field(None, gt=0.0, le=5.0, description="of what has none of its own")
-    object_size_m: float | None = Field(None, ge=0.02, le=0.07, description="of objects that are only named")
+    object_mass_kg: float | None = Field(None, gt=0.0, le=5.0, description="of several only of those that are named")
+    object_size_m: float | None = Field(None, ge=0.02, le=0.07, description="of one cube or sphere")
     friction: float | None = Field(None, gt=0.0, le=3.0)
     pad_friction: float | None = Field(None, gt=0.0, le=3.0)
     physics_step_s: float | None = Field(None, gt=0.0, le=0.01, description="None: that of training")
@@ -160,7 +160,7 @@ class MujocoRobot:
 
     def _places(self, state: StateArray) -> StateArray:
         """(K, 3) the objects' centres in a state; a view."""
-        found: StateArray = places_at(state[None], pose_columns(self._layout, "object", self.world.num_objects))[0]
+        found: StateArray = places_at(state[None], object_columns(self._layout, self.world.num_objects))[0]
         return found
 
     def _joints(self) -> StateArray:
@@ -180,7 +180,7 @@ def connect(world: WorldConfig, parameters: Mapping[str, Any]) -> Backend:
     if world.obstacles:  # starts would be drawn into them
         raise TandemError("robot mujoco: obstacles are elsewhere in every episode, and nothing tells a bridge where")
     given = MujocoParameters.model_validate(parameters)
-    if given.object_size_m is not None and not all(isinstance(each, str) for each in (*world.objects, world.object)):
-        raise TandemError("robot mujoco: parameters: object_size_m is of a cube or sphere; this object has its own")
+    if given.object_size_m is not None and (world.num_objects > 1 or not isinstance(world.object, str)):
+        raise TandemError("robot mujoco: parameters: object_size_m is of one cube or sphere; these objects have theirs")
     robot = MujocoRobot(world, given)
     return Backend(robot, ExactPoses(robot, robot), robot)

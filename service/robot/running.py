@@ -21,8 +21,8 @@ from service.config.frozen import first_error
 from service.config.world import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import distances, each_object
-from service.envs.sampling import Places, draw_goals, draw_objects, draw_starts
-from service.envs.state_layout import places_at, pose_columns
+from service.envs.sampling import Places, draw_first, draw_goals, draw_starts
+from service.envs.state_layout import object_columns, places_at
 from service.media.recording import RecordedEpisodes
 from service.methods.compose import check_robot
 from service.registry.loading import Trained
@@ -49,7 +49,7 @@ def for_robot(trained: Trained) -> Trained:
     """The same in its nominal world, where it was trained in worlds that are drawn: a robot is one.
 
     Raises:
-        TandemError: skills, a policy that composes nothing, or one of another robot.
+        TandemError: skills, a policy that composes nothing, one of another robot, or one that observes obstacles.
     """
     trained.expect("primitives", "orchestrator", by="tandem robot")
     if trained.kind == "orchestrator" and trained.trained is None:
@@ -90,13 +90,14 @@ def play(
     """
     rng = np.random.default_rng(seed)
     places = _starts(rng, num_episodes, policy.world, simulated=backend.simulator is not None)
-    goals = np.zeros((num_episodes, 3 * policy.world.num_objects))
-    if goal_m is None:
-        goals = draw_goals(policy.tried_on.goal_kind, rng, policy.world, policy.success_distance_m, places)
+    kind, goals = policy.tried_on.goal_kind, np.zeros((num_episodes, 3 * policy.world.num_objects))
+    depends = policy.world.fixture != "none" or kind == "one"  # on where the objects are
+    if goal_m is None and (backend.simulator is not None or not depends):
+        goals = draw_goals(kind, rng, policy.world, policy.success_distance_m, places)
     for episode in range(num_episodes):
         if backend.simulator is not None:
             backend.begin(places.object[episode])
-        elif goal_m is None and policy.world.fixture != "none":
+        elif goal_m is None and depends:
             goals[episode] = _goal_from(backend, rng, policy)
         goal = goals[episode] if goal_m is None else goal_m
         ready(episode, goal)
@@ -109,16 +110,16 @@ def play(
 def _starts(rng: np.random.Generator, num: int, world: WorldConfig, *, simulated: bool) -> Places:
     """Random starts as in training; of a real robot nothing is put there, and no world has to be built."""
     if not simulated:
-        return draw_objects(rng, num, world)
+        return draw_first(rng, num, world)
     with WorldBatch(world, 1, num_threads=1) as worlds:
         return draw_starts(rng, num, world, worlds.gripper_at_start)
 
 
 def _goal_from(backend: Backend, rng: np.random.Generator, policy: Trained) -> StateArray:
-    """(3,) a goal for the object where it lies; behind a wall it depends on that."""
+    """(3 K,) a goal for objects where they lie: it is behind the wall from there, or asks some to stay."""
     object_m = backend.poses.read().position_m
     if not np.isfinite(object_m).all():
-        raise RobotError("the object is not seen: put it on the table in view of what sees it")
+        raise RobotError("an object is not seen: put it on the table in view of what sees it")
     if policy.world.fixture == "box":
         raise RobotError(f"{policy.label} brings the object into a box, and nothing tells a bridge where it is: --goal")
     places = Places(object_m[None], np.empty((1, 0)), np.empty((1, 0, 3)))
@@ -184,7 +185,7 @@ def _recorded(world: WorldConfig, episodes: list[list[dict[str, Any]]], success_
     goal = np.array([steps[0]["goal_m"] for steps in episodes])
     with WorldBatch(world, len(episodes), num_threads=1) as worlds:
         arm, layout = worlds.robot.arm, worlds.layout
-        objects = pose_columns(layout, "object", world.num_objects)
+        objects = object_columns(layout, world.num_objects)
         states = np.tile(worlds.states, (num_steps, 1, 1))
         joints = np.tile(arm.home, (len(episodes), 1))
         for step in range(num_steps):

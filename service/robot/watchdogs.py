@@ -16,9 +16,9 @@ import numpy as np
 from pydantic import Field
 
 from service.base.errors import TandemError
-from service.base.types import StateArray
+from service.base.types import BoolArray, StateArray
 from service.config.frozen import FrozenModel
-from service.envs.observations import distances
+from service.envs.observations import distances, each_object
 from service.robot.interface import ObjectPose, RobotState
 
 _CLOCKS_AGREE_S = 0.02
@@ -85,6 +85,7 @@ class PoseWatch:
         self._jumping_since_s: float | None = None
         self._missing_since_s: float | None = None
         self._gap_s = 0.0
+        self._missing = self._jumping = "the object"
 
     def check(self, pose: ObjectPose, now_s: float) -> str | None:
         """Take a pose; what is wrong, if anything."""
@@ -97,31 +98,39 @@ class PoseWatch:
             self._stamp_s, self._new_s = pose.time_s, now_s
             self._take(pose, now_s)
         if not np.isfinite(self.time_s):
-            return "the object is not seen"
+            return f"{self._missing} is not seen"
         if now_s - self._new_s > self._config.max_frozen_s + _ROUNDING_S:
             return f"the object's pose is frozen: no new one for {1e3 * (now_s - self._new_s):.0f} ms"
         if self._missing_since_s is not None and now_s - self._missing_since_s > self._config.max_frozen_s:
-            return f"the object is not seen, for {1e3 * (now_s - self._missing_since_s):.0f} ms already"
+            return f"{self._missing} is not seen, for {1e3 * (now_s - self._missing_since_s):.0f} ms already"
         if self._jumping_since_s is not None and now_s - self._jumping_since_s > self._config.max_jump_s:
-            return f"the object's pose jumps, for {1e3 * (now_s - self._jumping_since_s):.0f} ms already"
+            return f"the pose of {self._jumping} jumps, for {1e3 * (now_s - self._jumping_since_s):.0f} ms already"
         if now_s - self.time_s > self._config.max_pose_age_s:
             return f"the object's newest pose is {1e3 * (now_s - self.time_s):.0f} ms old"
         return None
 
     def _take(self, pose: ObjectPose, now_s: float) -> None:
-        if not np.isfinite(pose.position_m).all():
+        place = np.asarray(pose.position_m, dtype=np.float64)  # None becomes NaN
+        if not np.isfinite(place).all():
+            self._missing = self._which(~np.isfinite(each_object(place)).all(axis=1))
             self._missing_since_s = now_s if self._missing_since_s is None else self._missing_since_s
             return
         self._missing_since_s = None
         if np.isfinite(self.time_s):
-            far_m = float(distances(pose.position_m, self.position_m).max())
+            far_m = distances(place, self.position_m)
             if self._jumping_since_s is None:
                 self._gap_s = pose.time_s - self.time_s  # kept while it jumps, or in time any jump were slow enough
-            if far_m > self._config.jump_allowance_m + self._config.max_object_speed_m_s * self._gap_s:
+            jumps = far_m > self._config.jump_allowance_m + self._config.max_object_speed_m_s * self._gap_s
+            if jumps.any():
+                self._jumping = self._which(jumps)
                 self._jumping_since_s = now_s if self._jumping_since_s is None else self._jumping_since_s
                 return
         self._jumping_since_s = None
-        self.position_m, self.time_s = np.array(pose.position_m, dtype=np.float64), pose.time_s
+        self.position_m, self.time_s = place.copy(), pose.time_s
+
+    def _which(self, some: BoolArray) -> str:
+        """The first of (K,) objects that are meant, in words."""
+        return "the object" if len(some) == 1 else f"object {int(np.argmax(some)) + 1}"
 
 
 class HeldKey:

@@ -398,7 +398,7 @@ def test_a_film_that_cannot_be_made(arguments, part, tmp_path, monkeypatch):
 def test_a_goal_of_a_film_is_in_no_fixture():
     world = WorldConfig(fixtures=[{"shape": "box", "size_m": (0.1, 0.1, 0.1), "position_m": (0.05, 0.05)}])
     assert parse_goals("0.05,0.05,0.2", world).tolist() == [[0.05, 0.05, 0.2]]
-    with pytest.raises(TandemError, match=r"--goals: at 0\.050, 0\.050, 0\.050 the object would be inside a fixture"):
+    with pytest.raises(TandemError, match=r"--goals: at 0\.050, 0\.050, 0\.050 an object would be inside a fixture"):
         parse_goals("0.05,0.05,0.2; 0.05,0.05,0.05", world)
 
 

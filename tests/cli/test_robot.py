@@ -75,7 +75,7 @@ def test_two_cubes_have_a_goal_each_and_are_drawn_where_they_were(tmp_path):
     assert drawn.goal.shape == (1, 6)
     assert_refused(
         invoke("run", "--robot", "mujoco", goal.replace("0.025", "0.02"), *two),
-        "write one point, no lower than the object lies, 0.025 and 0.025 m",
+        "write one point, no lower than each object lies, 0.025 and 0.025 m",
     )
 
 
@@ -133,7 +133,7 @@ def test_what_cannot_be_run_is_one_line(arguments, said):
 
 def test_a_goal_inside_the_wall_is_refused_and_one_behind_it_is_not():
     wall = WorldConfig(fixture="wall")
-    with pytest.raises(TandemError, match=r"^--goal: at -0\.050, 0\.000, 0\.025 the object would be inside a fixture"):
+    with pytest.raises(TandemError, match=r"^--goal: at -0\.050, 0\.000, 0\.025 an object would be inside a fixture"):
         parse_goal("-0.05,0,0.025", wall)
     np.testing.assert_array_equal(parse_goal("0.125,0,0.025", wall), [0.125, 0.0, 0.025])  # at the very edge
 
@@ -174,7 +174,7 @@ def test_a_real_robot_wants_a_dead_mans_switch_and_a_person(monkeypatch):
     assert robot.commands == []
     ran = invoke(*asked, answers="\n")
     assert ran.exit_code == 0, ran.output
-    assert "put arm and object to their start, then press Enter" in ran.stderr
+    assert "put arm and objects to their start, then press Enter" in ran.stderr
     assert robot.commands
 
 

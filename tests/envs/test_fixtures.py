@@ -8,7 +8,7 @@ from service.base.errors import ConfigError
 from service.config import WorldConfig
 from service.config.objects import FixtureConfig
 from service.envs.batch import WorldBatch
-from service.envs.sampling import draw_objects, sample_goals
+from service.envs.sampling import draw_first, sample_goals
 from tests.envs.scripted import CLOSE, drive
 from tests.runs.runs import assert_one_line
 
@@ -67,7 +67,7 @@ def test_no_goal_is_inside_and_all_other_places_are_drawn(kind):
 
 
 def test_an_open_finger_fits_beside_every_start():
-    position = draw_objects(np.random.default_rng(0), 5000, WORLD).object
+    position = draw_first(np.random.default_rng(0), 5000, WORLD).object
     assert not inside(position, (0.005, 0.04, 0.005)).any()
     assert inside(position, (0.02, 0.06, 0.02)).any()
 

@@ -7,7 +7,7 @@ import pytest
 from service.base.errors import ConfigError
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.sampling import draw_objects
+from service.envs.sampling import draw_first
 from tests.envs.scripted import place_in_air
 from tests.runs.runs import assert_one_line
 
@@ -101,7 +101,7 @@ def test_a_cube_and_a_sphere_by_their_names_are_what_they_were():
 @pytest.mark.parametrize("fixture", ["wall", "box"])
 def test_a_long_object_starts_clear_of_a_fixture(fixture):
     world = WorldConfig(object={"shape": "box", "size_m": (0.12, 0.03, 0.03)}, fixture=fixture)
-    position, box, _ = draw_objects(np.random.default_rng(0), 2000, world)
+    position, box, _ = draw_first(np.random.default_rng(0), 2000, world)
     if fixture == "wall":
         assert np.abs(position[:, 0] - world.workspace.center_x_m).min() >= 0.06 + 0.005 + 0.005
     else:
@@ -123,14 +123,14 @@ class Counted:
 
 def test_a_workspace_in_which_most_places_of_the_box_leave_no_room():
     world = WorldConfig(fixture="box", workspace={"length_x_m": 0.12, "length_y_m": 0.15})
-    position, box, _ = draw_objects(Counted(5000), 200, world)
+    position, box, _ = draw_first(Counted(5000), 200, world)
     away = np.abs(position - box)[:, :2]
     assert ((away[:, 0] >= 0.05 + 0.025 + 0.005) | (away[:, 1] >= 0.05 + 0.025 + 0.04)).all()
     for place in (position, box):
         assert (np.abs(place[:, :2] - [-0.05, 0.0]) <= [0.06, 0.075]).all()
     world = WorldConfig(fixture="box", workspace={"length_x_m": 0.07, "length_y_m": 0.11})
     with pytest.raises(ConfigError) as error:
-        draw_objects(Counted(5000), 1, world)
+        draw_first(Counted(5000), 1, world)
     assert_one_line(error.value, "no room in the workspace for the object beside the box", "world.workspace larger")
 
 

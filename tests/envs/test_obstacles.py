@@ -181,7 +181,10 @@ def test_no_goal_that_is_replayed_from_a_reset_is_inside_one():
 @pytest.mark.parametrize(
     ("world", "said"),
     [
-        ({"obstacles": [{"shape": "box", "size_m": (0.3, 0.3, 0.05)}] * 5}, ["world.obstacles", "the 5 of them"]),
+        (
+            {"obstacles": [{"shape": "box", "size_m": (0.3, 0.3, 0.05)}] * 5},
+            ["world.workspace", "no room in it for 1 object and 5 obstacles"],
+        ),
         (
             {"object": {"shape": "box", "size_m": (0.5, 0.5, 0.3)}, "gripper": "blocked"},
             ["0.3 m high", "inside the gripper"],

@@ -66,7 +66,7 @@ def test_a_bank_covers_each_range_evenly_and_its_models_are_as_drawn():
         np.testing.assert_array_equal(finger.gainprm, bank.nominal.actuator("left_finger").gainprm)
         assert model.geom("table").pos[2] - bank.nominal.geom("table").pos[2] == pytest.approx(drawn["table_height_m"])
         rest_m = 0.025 * drawn["object_size"] + drawn["table_height_m"]
-        assert bank.rest_height_m[index] == pytest.approx(rest_m)
+        assert bank.rest_heights_m[index] == pytest.approx(rest_m)
 
 
 def test_fingers_do_not_sink_into_a_raised_table():

@@ -53,6 +53,11 @@ def test_what_is_named_has_the_worlds_size_mass_and_friction_and_a_color_of_its_
     assert sphere.shape == "sphere"
     assert len({cube.color, cylinder.color, sphere.color}) == 3
     assert world.rest_heights_m == (0.02, 0.03, 0.02)
+    can = {"shape": "cylinder", "size_m": (0.04, 0.06)}  # of what it does not say as well
+    world = WorldConfig(objects=(can, can, {**can, "friction": 0.8}), object_mass_kg=0.3, friction=0.5)
+    assert [(each.mass_kg, each.friction) for each in world.bodies] == [(0.3, 0.5), (0.3, 0.5), (0.3, 0.8)]
+    assert [each.color for each in world.bodies] == [each.color for each in WorldConfig(objects=["cube"] * 3).bodies]
+    assert WorldConfig.model_validate(world.model_dump()) == world
 
 
 @pytest.mark.parametrize("config", [CUBES, MIXED, WorldConfig(objects=("cube", "cube", CYLINDER), **FAST)])
@@ -70,6 +75,17 @@ def test_they_start_clear_of_each_other_with_room_for_a_finger(config):
             in_line = beside[:, 0] < 0.04  # along x: then a finger has to fit between them along y
             assert in_line.any()
             assert (beside[in_line, 1] >= (widths[one] + widths[other]) / 2 + 0.04 - 1e-9).all()
+
+
+def test_a_finger_fits_between_each_and_a_fixture():
+    fixture = {"shape": "box", "size_m": (0.3, 0.06, 0.04), "position_m": (-0.05, 0.0)}
+    with WorldBatch(WorldConfig(objects=("cube", "cube"), fixtures=[fixture], **FAST), 300) as worlds:
+        worlds.reset(np.random.default_rng(0))
+        place = each_object(worlds.object_position)
+    in_line = np.abs(place[:, :, 0] + 0.05) < 0.15 + 0.02
+    for number in range(2):
+        away = np.abs(place[in_line[:, number], number, 1]) - 0.03 - 0.025
+        assert 0.04 - 1e-9 <= away.min() < 0.05
 
 
 def test_observations_have_as_much_of_each(worlds):
@@ -192,7 +208,7 @@ def test_worlds_that_do_not_go_together(world, said):
 def test_objects_that_do_not_fit_on_the_table_are_refused():
     board = {"shape": "box", "size_m": (0.3, 0.06, 0.04)}
     small = {"length_x_m": 0.1, "length_y_m": 0.1}
-    with pytest.raises(ConfigError, match=r"world\.objects: no room in the workspace for the 3 of them"):
+    with pytest.raises(ConfigError, match=r"world\.workspace: no room in it for 4 objects beside each other"):
         WorldBatch(WorldConfig(objects=("cube", board, board, board), workspace=small), 1)
 
 

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from service.actors.evaluation import IdlePolicy, evaluate
+from service.base.errors import ConfigError
 from service.base.user_code import CodeError
 from service.config import WorldConfig
+from service.config.world import RandomisationConfig
 from service.envs.batch import WorldBatch
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.observations import each_object
@@ -54,6 +56,12 @@ def test_red_starts_on_blue_where_it_is_to_be_taken_from():
     np.testing.assert_array_equal(place, again)
     other, _ = started(TASKS["UNSTACK"], seed=1)
     assert (place != other).any()
+
+
+def test_starts_know_objects_of_one_size():
+    sizes = FAST.model_copy(update={"randomisation": RandomisationConfig(object_size=(0.7, 1.3), num_models=4)})
+    with pytest.raises(ConfigError, match="Unstack: its starts know objects of one size"):
+        TabletopVectorEnv(2, sizes, task=TASKS["UNSTACK"])
 
 
 def test_later_episodes_start_there_too():

@@ -111,6 +111,8 @@ def test_goals_are_typed_for_all(two):
         parse_goals("-0.1,0,0.02", two.world)
     with pytest.raises(TandemError, match="outside of the workspace"):
         parse_goals("-0.1,0,0.02,0.9,0.1,0.02", two.world)
+    with pytest.raises(TandemError, match=r"025, -0\.070, 0\.000, 0\.025 objects would be inside each other"):
+        parse_goals("-0.1,0,0.025,-0.07,0,0.025", two.world)
 
 
 def test_who_knows_one_object_says_so(two):

@@ -51,13 +51,15 @@ def test_two_objects_have_noise_of_their_own_and_the_same_offset():
     robot = FakeRobot()
     robot.poses.position_m = np.concatenate((OBJECT_M, HOME_M))
     config = DisturbanceConfig(pose_noise_m=0.005, pose_offset_m=(0.01, 0.0, -0.02))
-    poses, found = DisturbedPoses(robot.poses, robot.now_s, config), []
+    poses, found = DisturbedPoses(robot.poses, robot.now_s, config, num_objects=2), []
     for _ in range(2000):
         robot.advance(0.004)
         found.append(poses.read().position_m)
     away = np.array(found) - robot.poses.position_m
     np.testing.assert_allclose(away.mean(axis=0), [0.01, 0.0, -0.02] * 2, atol=5e-4)
     assert np.abs(np.corrcoef(away.T) - np.eye(6)).max() < 0.1
+    robot.poses.position_m = np.zeros((2, 3))
+    assert poses.read().position_m.shape == (2, 3)  # what is wrong with it is the watchdog's to say
 
 
 def test_a_new_start_knows_nothing_of_the_episode_before():

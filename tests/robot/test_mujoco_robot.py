@@ -160,7 +160,7 @@ def test_a_grip_force_does_not_bound_the_torque_of_fingers_that_turn(tmp_path):
     [
         ({"fixture": "box"}, {}, "the box is elsewhere"),
         ({"obstacles": ({"shape": "box", "size_m": (0.06, 0.06, 0.06)},)}, {}, "obstacles are elsewhere"),
-        ({"object": {"shape": "cylinder", "size_m": (0.05, 0.06)}}, {"object_size_m": 0.04}, "has its own"),
+        ({"object": {"shape": "cylinder", "size_m": (0.05, 0.06)}}, {"object_size_m": 0.04}, "have theirs"),
     ],
 )
 def test_what_it_cannot_show_is_refused_before_anything_moves(world, parameters, match):

@@ -7,10 +7,11 @@ import pytest
 from service.base.errors import TandemError
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.sampling import draw_goals, draw_objects, inside_gripper_or_table
+from service.envs.sampling import draw_first, draw_goals, inside_gripper_or_table
 from service.envs.task import Task
 from service.registry.bundled import BUNDLED
 from service.registry.loading import load
+from service.robot.interface import ObjectPose
 from service.robot.running import for_robot, play, read_log
 from tests.export.policies import publish_bob, write_training
 from tests.methods.skill_sets import made
@@ -69,8 +70,20 @@ def test_a_simulators_object_starts_as_in_training(height_m, tmp_path):
     with WorldBatch(world, 1, num_threads=1) as worlds:
         clear = ~inside_gripper_or_table(np.array(begun), world, worlds.gripper_at_start, worlds.rest_heights)
     assert clear.all()
-    anywhere = draw_objects(rng, 30, world)
+    anywhere = draw_first(rng, 30, world)
     same = (anywhere.object == begun).all(axis=1)
     assert same.sum() == 30 if height_m < 0.07 else 15 < same.sum() < 30
     if same.all():
         np.testing.assert_array_equal(goals, draw_goals("mixed", rng, world, policy.success_distance_m, anywhere))
+
+
+def test_on_a_real_robot_the_other_object_stays_where_it_is_seen(tmp_path):
+    policy = replace(for_robot(load("panda-two-cubes@champion", tmp_path)), task=Task("One", goals="one"))
+    seen = np.array([0.0, 0.1, 0.025, 0.05, -0.1, 0.025])
+    backend = SimpleNamespace(simulator=None, poses=SimpleNamespace(read=lambda: ObjectPose(0.0, seen)))
+    bridge = SimpleNamespace(run=lambda goal_m, num_steps: 0.0)
+    given = {"goal_m": None, "num_episodes": 20, "num_steps": 1, "seed": 0, "ready": lambda episode, goal_m: None}
+    goals = np.array([outcome.goal_m for outcome in play(bridge, backend, policy, **given)])
+    stays = (goals == seen).reshape(20, 2, 3).all(axis=2)
+    assert (stays.sum(axis=1) == 1).all()
+    assert stays.any(axis=0).all()

@@ -25,7 +25,7 @@ FAULTS = {
     "frozen pose": "the object's pose is frozen",
     "ageing pose": "the object's newest pose is",
     "unseen": "the object is not seen",
-    "jumping pose": "the object's pose jumps",
+    "jumping pose": "the pose of the object jumps",
     "no pose": "no pose was read",
     "early pose": "set the clocks alike",
     "switch": "the dead-man's switch was let go",

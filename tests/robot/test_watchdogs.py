@@ -60,5 +60,7 @@ def test_each_of_two_objects_is_watched():
     np.testing.assert_array_equal(seen(first, second + far), [*first, *second])
     np.testing.assert_array_equal(seen(first + far, second), [*first, *second])
     np.testing.assert_array_equal(seen(first + near, np.full(3, np.nan)), [*first, *second])
+    watch = watchdogs.PoseWatch(watchdogs.WatchConfig(), 2)
+    assert watch.check(ObjectPose(0.0, [*first, None, None, None]), 0.0) == "object 2 is not seen"
     fault = watchdogs.PoseWatch(watchdogs.WatchConfig(), 2).check(ObjectPose(0.0, first), 0.0)
     assert fault == "an object pose of the shape (3,), not (6,): x, y, z, x, y, z"

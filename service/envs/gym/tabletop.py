@@ -17,7 +17,7 @@ from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, each_object, layouts
 from service.envs.rules import Rules
-from service.envs.sampling import inside_fixtures
+from service.envs.sampling import inside_each_other, inside_fixtures
 from service.envs.task import Task, View, view_of_places
 from service.envs.tasks import find_task
 
@@ -158,9 +158,11 @@ class GoalWorlds:
             )
         for bad in goal[inside_fixtures(goal, self.config)]:
             raise TandemError(
-                f"reset: options['goal'] ({in_metres(bad)}) m: the object would be inside a fixture, or the upright "
-                "box around it"
+                f"reset: options['goal'] ({in_metres(bad)}) m: an object would be inside a fixture, or the upright box "
+                "around it"
             )
+        for bad in goal[inside_each_other(goal, self.config)]:
+            raise TandemError(f"reset: options['goal'] ({in_metres(bad)}) m: objects would be inside each other")
         return goal
 
     def _advance(self, actions: FloatArray) -> BoolArray:

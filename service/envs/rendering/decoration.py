@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from service.base.types import StateArray
 from service.config import WorkspaceConfig, WorldConfig
 from service.config.model_files import Vector
-from service.envs.objects import FLOOR_Z_M
+from service.envs.objects import FLOOR_Z_M, object_names
 from service.envs.scene import FIXTURE_PREFIX, TABLE_CENTER_X_M, TABLE_HALF_SIZE_M
 
 _TABLE_THICKNESS_M = 0.035
@@ -28,7 +28,6 @@ _MATERIALS: dict[str, dict[str, Any]] = {
     "cap": {"rgba": (0.70, 0.72, 0.74, 1.0), "specular": 0.3, "shininess": 0.4},
     "steel": {"rgba": (0.50, 0.52, 0.55, 1.0), "specular": 0.6, "shininess": 0.7},
     "rubber": {"rgba": (0.09, 0.09, 0.10, 1.0), "specular": 0.05, "shininess": 0.1},
-    "object": {"specular": 0.35, "shininess": 0.5},
     "fixture": {"rgba": (0.42, 0.47, 0.54, 1.0), "specular": 0.3, "shininess": 0.4},
     "leg": {"rgba": (0.24, 0.25, 0.27, 1.0), "specular": 0.2, "shininess": 0.3},
     "outline": {"rgba": (0.10, 0.36, 0.62, 0.85), "emission": 0.3, "specular": 0.0},
@@ -52,9 +51,10 @@ def decorate(spec: mujoco.MjSpec, config: WorldConfig) -> None:
     _add_floor_and_sky(spec)
     _add_lights(spec)
     _add_workspace(spec, config.workspace)
-    spec.material("object").rgba = (*config.shape.color, 1.0)
-    for geom in spec.body("object").geoms:
-        geom.material = "object"
+    for name, body in zip(object_names(config), config.bodies, strict=True):
+        spec.add_material(name=name, rgba=(*body.color, 1.0), specular=0.35, shininess=0.5)
+        for geom in spec.body(name).geoms:
+            geom.material = name
     for geom in spec.geoms:
         if geom.name.startswith(FIXTURE_PREFIX):
             geom.material = "fixture"

@@ -99,7 +99,7 @@ def test_a_goal_inside_a_fixture_is_refused(world, fitting, inside):
     for goal in fitting:
         np.testing.assert_array_equal(env.reset(options={"goal": goal})[0]["desired_goal"], np.float32(goal))
     for goal in inside:
-        with pytest.raises(TandemError, match=r"options\['goal'\] \(.*\) m: the object would be inside a fixture"):
+        with pytest.raises(TandemError, match=r"options\['goal'\] \(.*\) m: an object would be inside a fixture"):
             env.reset(options={"goal": goal})
     env.close()
     drawn = [*fitting[:1], *inside, *fitting[1:]]
