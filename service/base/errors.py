@@ -117,11 +117,7 @@ class DamagedStoreError(StoreError):
     exit_code = 1
 
 
-class ExportError(TandemError):
-    """What was asked for cannot be exported; the message says why, and what to do."""
-
-
-class ParityError(ExportError):
+class ParityError(TandemError):
     """What was written does not compute what the evaluator's policy does."""
 
     exit_code = 1
@@ -131,10 +127,6 @@ class RobotError(TandemError):
     """A robot did not answer or refused; the message says which, and what to look at."""
 
     exit_code = 1
-
-
-class SafetyStopError(RobotError):
-    """The robot was stopped; the message says why."""
 
 
 def one_line(text: str, max_characters: int = 2000) -> str:

@@ -27,7 +27,7 @@ class DistillationConfig(FrozenModel):
         description="share of episodes in which random weights compose the primitives: what is composed downstream "
         "goes where Bob himself does not",
     )
-    random_hold_steps: int = Field(5, ge=1, description="that such weights are held")
+    random_hold_steps: int = Field(5, ge=1, description="env steps for which such weights are held")
     action_noise: float = Field(
         0.3, ge=0.0, le=1.0, description="std of noise on every second action of a world: it leaves the usual path"
     )

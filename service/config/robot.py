@@ -90,7 +90,7 @@ class RobotConfig(FrozenModel):
     root: str | None = Field(None, description="body of the model that the robot begins with; None: its only one")
     hand: HandConfig | None = None
     base_position_m: Vector = Field((0.0, 0.0, 0.0), description="of the root, from the table's origin")
-    base_turn_rad: float = Field(0.0, description="of the root about the vertical")
+    base_turn_rad: float = Field(0.0, description="turn of the root about the vertical")
     joints: tuple[str, ...] = Field(min_length=3, description="of the arm, from the base to the end effector")
     effector: EffectorConfig
     fingers: tuple[FingerConfig, ...] = Field(min_length=1)

@@ -82,9 +82,11 @@ class RandomisationConfig(FrozenModel):
         32, ge=1, le=1024, description="in the bank; more cover the ranges more densely, and 64 cost 5 % of throughput"
     )
     object_size: Range | None = Field(None, description="factor of all sizes of the object")
-    object_mass_kg: Range | None = Field(None, description="of several objects those that are only named")
+    object_mass_kg: Range | None = Field(
+        None, description="mass of the object; of several only of those that are named"
+    )
     friction: Range | None = Field(
-        None, description="sliding friction of the object, also on the table; of several those that are only named"
+        None, description="sliding friction of the object, also on the table; of several only of those that are named"
     )
     gain: Range | None = Field(None, description="factor of the stiffness of the arm's servos")
     damping: Range | None = Field(

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from service.base.errors import ExportError, ParityError
+from service.base.errors import ParityError, TandemError
 from service.base.files import new_directory, os_errors
 from service.base.types import FloatArray
 from service.envs.observations import Layouts, layouts
@@ -54,7 +54,7 @@ def export(
         What ``policy.json`` of the folder says.
 
     Raises:
-        ExportError: no such part, see ``networks_of``; no such format, or packages for it are missing.
+        TandemError: no such part, see ``networks_of``; no such format, or packages for it are missing.
         ParityError: what was written does not compute what the evaluator's policy does; nothing is left.
         StorageError: the folder is there already, or cannot be written.
     """
@@ -81,12 +81,12 @@ def networks_of(trained: Trained, part: str) -> list[Network]:
         TandemError: no such part; skills; or a policy that composes no primitives.
     """
     if part not in PARTS:
-        raise ExportError(f"unknown part {part!r}; choose one of {', '.join(PARTS)}")
+        raise TandemError(f"unknown part {part!r}; choose one of {', '.join(PARTS)}")
     trained.expect("primitives", "orchestrator", by="tandem export")
     frozen = trained
     if trained.kind == "orchestrator":
         if trained.trained is None or trained.trained.kind != "primitives":
-            raise ExportError(
+            raise TandemError(
                 f"{trained.label} was trained with a method that composes no primitives: export one of ours"
             )
         frozen = trained.trained

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from service.base.errors import ExportError, did_you_mean, needs_extra
+from service.base.errors import TandemError, did_you_mean, needs_extra
 from service.base.types import FloatArray
 from service.export.networks import Network, Outputs
 from service.policies import forward
@@ -48,11 +48,11 @@ def find_format(name: str) -> Format:
     """Find a format by its name.
 
     Raises:
-        ExportError: no such format.
+        TandemError: no such format.
         TandemError: packages that it needs are not installed.
     """
     if name not in FORMATS:
-        raise ExportError(f"unknown format {name!r}; choose one of {', '.join(FORMATS)}{did_you_mean(name, FORMATS)}")
+        raise TandemError(f"unknown format {name!r}; choose one of {', '.join(FORMATS)}{did_you_mean(name, FORMATS)}")
     with needs_extra("export", f"the format {name}"):
         for package in FORMATS[name].needs:
             importlib.import_module(package)

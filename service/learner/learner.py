@@ -239,7 +239,7 @@ def _num(rows: Samples | DemonstrationRows | None) -> int:
 def _prefixed(player: str, metrics: Metrics) -> Metrics:
     """Put the player's name before those that both have."""
     shared = ["non_finite_steps", "rollbacks"]
-    if player == "bob":  # these names were his before Alice cloned anything
+    if player == "bob":  # recorded runs have these of his without a prefix
         shared += ["cloning_loss", "demonstration_log_prob", "demonstration_log_ratio"]
     return {name if name in shared else f"{player}_{name}": value for name, value in metrics.items()}
 

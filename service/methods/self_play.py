@@ -34,7 +34,7 @@ from service.store.models import GoalGrid
 
 _logger = logging.getLogger(__name__)
 OLDER_OPPONENTS = -1
-"""Version of past players that a checkpoint has beside the task generator's, which have joined meanwhile."""
+"""Version of past opponents that a checkpoint keeps for a round not learned yet; those of the task generator differ."""
 
 
 class SelfPlay(Method):
@@ -174,7 +174,7 @@ class LocalSelfPlay(SelfPlay):
             "bob": weights.bob_ema,
         }
         if self._opponents.version != self.generator.opponents.version:
-            num = {"num": np.array(len(self._opponents.alice))}  # so that there is a part where there are none, too
+            num = {"num": np.array(len(self._opponents.alice))}  # an empty part would leave no trace
             parts["opponents"] = self._opponents.state() | num
         if self._pending is not None:
             parts["pending"] = to_arrays(self._pending)

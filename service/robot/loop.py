@@ -156,7 +156,7 @@ class Bridge:
         action = np.clip(action, -1.0, 1.0)
         self._commands.appendleft(action)
         target_m = state.effector_m + DISPLACEMENT_M * self._gain * action[:3]
-        # What a policy of a gripper held closed says of its width never meant anything.
+        # A gripper that was held closed in training ignored the width that the policy asked for.
         width_m = 0.0 if self._blocked else float(state.fingers_m.sum() + WIDTH_CHANGE_M * action[3])
         row |= {"target_m": target_m, "tick_times_s": [], "set_points_m": [], "measured_m": []}
         num = self._config.set_points_per_step

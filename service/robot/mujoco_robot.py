@@ -34,8 +34,10 @@ class MujocoParameters(FrozenModel):
         "by the speed of the set-points, as the controllers of real arms do; for set-points without jumps",
     )
     joint_friction_nm: float = Field(0.0, ge=0.0, le=20.0, description="dry friction of the arm's joints")
-    object_mass_kg: float | None = Field(None, gt=0.0, le=5.0, description="of several only of those that are named")
-    object_size_m: float | None = Field(None, ge=0.02, le=0.07, description="of one cube or sphere")
+    object_mass_kg: float | None = Field(
+        None, gt=0.0, le=5.0, description="mass; of several objects only of those that are named"
+    )
+    object_size_m: float | None = Field(None, ge=0.02, le=0.07, description="edge or diameter, of one object")
     friction: float | None = Field(None, gt=0.0, le=3.0)
     pad_friction: float | None = Field(None, gt=0.0, le=3.0)
     physics_step_s: float | None = Field(None, gt=0.0, le=0.01, description="None: that of training")

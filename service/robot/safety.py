@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 from pydantic import Field
 
-from service.base.errors import ConfigError, RobotError, SafetyStopError, in_metres
+from service.base.errors import ConfigError, RobotError, in_metres
 from service.base.types import StateArray
 from service.config.frozen import FrozenModel
 from service.config.world import Point, WorldConfig
@@ -147,7 +147,7 @@ class SafeRobot:
             due_s: when this should have happened.
 
         Raises:
-            SafetyStopError: the robot was stopped, now or before.
+            RobotError: the robot was stopped, now or before.
         """
         self._check_stopped()
         try:
@@ -192,7 +192,7 @@ class SafeRobot:
             arrive_s: time in which to arrive.
 
         Raises:
-            SafetyStopError: the robot was stopped, or the target is not finite.
+            RobotError: the robot was stopped, or the target is not finite.
         """
         self.check_finite(np.array([*target_m, width_m, arrive_s]), "a target")
         self._send(lambda gap_s: self.limiter.move(target_m, arrive_s, gap_s), width_m)
@@ -201,7 +201,7 @@ class SafeRobot:
         """Stop the robot if not all numbers are finite.
 
         Raises:
-            SafetyStopError: they are not.
+            RobotError: they are not.
         """
         if not np.isfinite(numbers).all():
             self._fail(f"{what} is not finite: {', '.join(f'{number:g}' for number in numbers)}")
@@ -232,7 +232,7 @@ class SafeRobot:
         """Wait for the next tick.
 
         Raises:
-            SafetyStopError: the robot was stopped.
+            RobotError: the robot was stopped.
         """
         self._expected_s = time_s  # the next sign of life
         try:
@@ -277,7 +277,7 @@ class SafeRobot:
 
     def _check_stopped(self) -> None:
         if self.stopped is not None:
-            raise SafetyStopError(f"stopped: {self.stopped}")
+            raise RobotError(f"stopped: {self.stopped}")
 
     def _fail(self, reason: str) -> None:
         self.stop(reason)

@@ -119,7 +119,7 @@ class PoseWatch:
         if np.isfinite(self.time_s):
             far_m = distances(place, self.position_m)
             if self._jumping_since_s is None:
-                self._gap_s = pose.time_s - self.time_s  # kept while it jumps, or in time any jump were slow enough
+                self._gap_s = pose.time_s - self.time_s  # stays while it jumps: after a while any jump would be slow
             jumps = far_m > self._config.jump_allowance_m + self._config.max_object_speed_m_s * self._gap_s
             if jumps.any():
                 self._jumping = self._which(jumps)

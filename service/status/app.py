@@ -139,11 +139,6 @@ def _service_router(runs: RunReader, registry: Registry, telemetry: Telemetry, t
             ) from None
         return ServiceState(status="ready")
 
-    @router.get("/healthz", summary="The same as /readyz", responses=_NOT_READY)
-    def healthz(request: Request) -> ServiceState:
-        """An older name of /readyz."""
-        return readyz(request)
-
     @router.get(
         "/metrics",
         summary="For Prometheus",

@@ -39,7 +39,7 @@ PARTS: dict[int | str, dict[str, Any]] = {
 """Answers of a route that gives a file, in addition to 200."""
 _RANGE = re.compile(r"([0-9]{1,20})-([0-9]{0,20})|-([0-9]{1,20})")
 _CONDITIONS = StaticFiles()
-"""Only for its ``is_not_modified``."""
+"""Starlette's class, whose ``is_not_modified`` compares a file with what a client has."""
 
 
 def kind_of(name: str) -> tuple[str, str]:

@@ -20,7 +20,7 @@ from tests.status.runs import BEARER, CLIENT, TOKEN, grid, publish, record, writ
 
 def test_health(client):
     assert client.get("/livez").json() == {"status": "alive"}
-    assert client.get("/readyz").json() == client.get("/healthz").json() == {"status": "ready"}
+    assert client.get("/readyz").json() == {"status": "ready"}
 
 
 def test_runs_newest_start_first(client):
@@ -228,7 +228,7 @@ def test_head_is_get_without_a_body(client):
 def test_openapi_lists_every_route(client, server):
     paths = client.get("/openapi.json").json()["paths"]
     assert set(paths) == {
-        "/livez", "/readyz", "/healthz", "/metrics", "/v1/runs", "/v1/runs/{run_id}", "/v1/runs/{run_id}/metrics",
+        "/livez", "/readyz", "/metrics", "/v1/runs", "/v1/runs/{run_id}", "/v1/runs/{run_id}/metrics",
         "/v1/runs/{run_id}/metrics/stream", "/v1/runs/{run_id}/goals", "/v1/runs/{run_id}/stop",
         "/v1/runs/{run_id}/files", "/v1/runs/{run_id}/files/{file}", "/v1/runs/{run_id}/video", "/v1/primitives",
         "/v1/primitives/{name}", "/v1/primitives/{name}/versions/{version}", "/v1/blobs/sha256/{digest}",

@@ -19,7 +19,7 @@ PARAMETERS = {
     "digest": "0" * 64,
 }
 BODIES = {"put": {"version": 1}}
-PROBES = {"/readyz", "/healthz"}
+PROBES = {"/readyz"}
 OPEN = {"/livez", "/", "/page/index.html", "/page/plotly.js"}
 """The page itself holds no secret, and has a form for the token."""
 SESSION = "/v1/session"
