@@ -32,7 +32,9 @@ os.environ["MPLBACKEND"] = "agg"
 os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_USAGE_STATS_ENABLED": "0"}
 os.environ |= {"RAY_prestart_worker_first_driver": "0"}  # no spare workers, a second of a core each
 # Else every call of CliRunner builds all commands anew: 30 ms, some thousand times.
-typer.testing._get_command = functools.cache(typer.testing._get_command)
+typer.main.get_command = typer.testing._get_command = functools.cache(typer.main.get_command)
+os.fsync = lambda descriptor: None  # no test pulls the plug, and a tiny run waits for the disk for a tenth of its time
+gc.disable()  # while tests are imported; see pytest_collection_finish
 
 TESTS = Path(__file__).parent
 SLOW = (
@@ -64,9 +66,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Leave what imports made out of garbage collection, which took a tenth of the time of many tests."""
+    """Begin garbage collection, without what imports made: that took a tenth of the time of many tests."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture

@@ -117,7 +117,7 @@ def test_env_throughput_measures_all_rows_in_turn():
 def test_only_grasping_arms_lift_the_object(config):
     heights = []
     for grasping in (False, True):
-        batch = env_throughput.BatchContender(config, 48, grasping=grasping)
+        batch = env_throughput.BatchContender(config, 12, grasping=grasping)
         batch.episode()
         heights.append(batch._worlds.object_position[:, 2].max())
     assert heights[0] < 0.04  # at rest the centre of the cube is 0.025 m high

@@ -7,13 +7,13 @@ from datetime import UTC, datetime
 import pytest
 
 from benchmarks import processes, scaling
-from benchmarks.compare_commits import measure_commit, train
+from benchmarks.compare_commits import measure_commit
 from benchmarks.measuring import ROOT
 from benchmarks.training_process import Measured, Records, measure_training
 from service.base.errors import TandemError
-from service.config import dump_config
 from service.store.models import ActorStatus, RunStatus
-from tests.runs.runs import tiny_config
+from service.store.run_directory import RunDirectory
+from tests.runs.runs import play, tiny_config
 from tools import faults
 from tools.rollout_audit import Stretch, audit_rollouts, stretches_of
 
@@ -155,9 +155,9 @@ def test_records_are_read_as_they_come(tmp_path):
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory):
     """A run of tiny games, some iterations old."""
-    home = tmp_path_factory.mktemp("tiny")
-    (home / "tiny.yaml").write_text(dump_config(tiny_config(total_env_steps=1_000_000_000)))
-    return train(ROOT, home, 100, home / "tiny.yaml")
+    path = tmp_path_factory.mktemp("tiny") / "run"
+    play(path, tiny_config(total_env_steps=1_000_000_000), on_iteration=lambda run, _: run.request_stop())
+    return RunDirectory(path)
 
 
 def test_a_box_by_hand():

@@ -20,6 +20,7 @@ from tests.runs.runs import play as play_rounds
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
     monkeypatch.setattr(record_run, "EPISODE_STEPS", 8)
+    monkeypatch.setitem(record_run.measure_coverage.__kwdefaults__, "num_sets", 2)
 
 
 def test_a_skill_run_is_recorded(tmp_path):

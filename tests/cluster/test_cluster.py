@@ -239,7 +239,7 @@ def test_workers_that_are_killed_are_replaced_and_no_others(tmp_path, monkeypatc
 
 def test_workers_that_hang_are_replaced_and_one_that_is_late_is_not(tmp_path, monkeypatch):
     """Iterations wait for learner and generator, and no round is lost by that; they do not wait for an actor."""
-    monkeypatch.setattr(watch, "STALL_S", 10.0)
+    monkeypatch.setattr(watch, "STALL_S", 6.0)
     frozen, played, errors, said = {}, {"generator": [], "learner": []}, [], []
 
     def bounded(slot, stall_s):
@@ -272,7 +272,7 @@ def test_workers_that_hang_are_replaced_and_one_that_is_late_is_not(tmp_path, mo
         while slot.late or not method.health().num_rollouts_refused:
             yield
         assert workers_of(run)["rollout-0"].incarnation == 0
-        yield from bounded(slot, 10.0)
+        yield from bounded(slot, 6.0)
         frozen["rollout-0"] = send(run, "rollout-0", signal.SIGSTOP)
         assert frozen["rollout-0"] == late
         yield from all_there(run, 1, [late])

@@ -16,7 +16,8 @@ def made(value):
 
 
 def test_what_is_copied_outlives_its_node():
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})  # the driver's; the other has all cores
+    bare = {"include_dashboard": False, "no_monitor": True, "include_log_monitor": False}
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0} | bare)  # the other node has all cores
     try:
         other = cluster.add_node(num_cpus=1)
         ray.init(address=cluster.address, log_to_driver=False)

@@ -169,6 +169,7 @@ def test_a_job_is_stopped_and_continued_and_publishes(head, tmp_path):
     write_yaml(work / "tiny.yaml")
     (port,) = free_ports(1)
     variables = {"TANDEM_RUNS": str(home / "runs"), "TANDEM_REGISTRY": str(home / "registry")}
+    variables["MUJOCO_GL"] = "off"  # no films
 
     client = wait_for(lambda: JobSubmissionClient(jobs))
 

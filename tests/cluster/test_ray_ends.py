@@ -55,7 +55,7 @@ def wait_until(process, holds):
     while not holds():
         assert process.poll() is None
         assert time.monotonic() < deadline_s
-        time.sleep(0.02)
+        time.sleep(0.2)
 
 
 @pytest.mark.parametrize(

@@ -102,7 +102,8 @@ def test_an_evaluation_starts_where_the_task_says():
         lambda s, rng: np.add(s.objects.place, [0.0, 0.0, -0.005]),
     ],
 )
-def test_objects_do_not_start_inside_anything_or_out_of_reach(starts):
+def test_objects_do_not_start_inside_anything_or_out_of_reach(starts, monkeypatch):
+    monkeypatch.setattr("service.envs.rules._MAX_DRAWS", 20)
     with WorldBatch(CUBES, 3, num_threads=1) as worlds:
         rng = np.random.default_rng(0)
         worlds.reset(rng)

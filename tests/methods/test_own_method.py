@@ -123,13 +123,14 @@ def test_a_key_of_one_method_is_unknown_to_another(file, method, key, said):
         ("def step", "def steps", "mine.py:37: TypeError: Can't instantiate abstract class Climb"),
         ("self.rng.random()", "self.rng.radnom()", "mine.py:14: AttributeError: "),
         ("Iteration(self.count(10) | {", "dict(self.count(10) | {", "mine.py: step gave a dict; give an Iteration"),
-        ("count(10)", "count(0)", "mine.py: 1000 iterations made no env steps; say how many with self.count(NUMBER)"),
+        ("count(10)", "count(0)", "mine.py: 20 iterations made no env steps; say how many with self.count(NUMBER)"),
         ('"evaluation/height": self.height', '"evaluation/height": 1 / 0', "mine.py:18: ZeroDivisionError: "),
         ('"rng": self.rng.bit', '"rng": self.rgn.bit', "mine.py:24: AttributeError: "),
         ('return {"evaluation/height": self.height}', "pass", "TypeError: 'NoneType' object is not iterable"),
     ],
 )
-def test_an_error_of_the_method_names_its_line(file, tmp_path, old, new, said):
+def test_an_error_of_the_method_names_its_line(file, tmp_path, monkeypatch, old, new, said):
+    monkeypatch.setattr("service.runs.run.MAX_IDLE", 20)
     assert old in CODE
     file.write_text(CODE.replace(old, new))
     with pytest.raises(ConfigError) as error:

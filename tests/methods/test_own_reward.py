@@ -13,7 +13,7 @@ from service.runs.train import train
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import KilledError, assert_one_line, assert_same_run
 
-pytestmark = pytest.mark.usefixtures("default_signals")
+pytestmark = pytest.mark.usefixtures("default_signals", "no_artifacts")
 CODE = """
 from service.methods.intrinsic_reward import IntrinsicReward
 

@@ -19,7 +19,7 @@ from tests.cli.typed import tandem
 from tests.envs.test_meshes import write_box
 from tests.runs.runs import KilledError, assert_one_line, assert_same_run
 
-pytestmark = pytest.mark.usefixtures("default_signals", "no_video")
+pytestmark = pytest.mark.usefixtures("default_signals", "no_artifacts")
 CODE = """
 import numpy as np
 from service.envs.task import Task
@@ -43,13 +43,6 @@ SMALL = (
     "sac.gradient_steps=1", "run.total_env_steps=192", "run.checkpoint_interval=2", "run.evaluation_interval=2",
     "run.evaluation_episodes=2", "run.final_episodes=4", "run.num_threads=1",
 )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def no_video():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("service.media.video.write_episode_video", lambda episodes, world, path, options: path)
-        yield
 
 
 @pytest.fixture
@@ -137,8 +130,9 @@ def test_primitives_that_moved_are_named_at_a_resume(file, tmp_path):
 
 def test_a_method_that_takes_no_primitives_keeps_those_it_names(file, tmp_path):
     registry = tmp_path / "registry"
-    config = begun(registry, "method=scratch-mcp-her")
-    train(config, RunDirectory(tmp_path / "run"), registry, publish=False, on_iteration=lambda _: None)
+    directory = RunDirectory(tmp_path / "run")
+    directory.start(begun(registry, "method=scratch-mcp-her"))
+    directory.close()
     with pytest.raises(TandemError) as error:
         resumed_config(RunDirectory(tmp_path / "run"), ["primitives=panda-cube-robust@champion"])
     assert_one_line(

@@ -71,6 +71,7 @@ def home(tmp_path_factory, champion, no_video):
 # --- a run -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("no_artifacts")
 @pytest.mark.parametrize("method", ["ours-her", "lsd"])
 def test_a_killed_run_is_resumed_as_the_uninterrupted_one(tmp_path, method):
     registry, config = tmp_path / "registry", small_trial(method)
@@ -117,6 +118,7 @@ def test_what_it_leaves(home, champion):
     assert (trial.task, trial.method, trial.primitives) == ("push", "ours", champion.manifest.reference)
 
 
+@pytest.mark.usefixtures("no_artifacts")
 def test_a_run_that_has_ended_is_measured_again_and_published_by_a_resume(home, tmp_path):
     path = shutil.copytree(home / "runs" / "ours", tmp_path / "run")
     kept = newest(path).arrays
