@@ -6,6 +6,7 @@ import re
 import shlex
 import signal
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +18,8 @@ from service.base.lock import DirectoryLock
 from service.cli.evaluate import parse_goals
 from service.config import WorldConfig, load_config
 from service.config.recipes import recipes
+from service.media import artifacts
+from service.media.video import FilmOptions
 from service.methods import task_evaluation  # noqa: F401  before the function that it calls is replaced
 from service.registry.bundled import BUNDLED
 from service.registry.registry import Registry
@@ -43,6 +46,8 @@ def trained(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("service.media.artifacts.NUM_RECORDED_ROUNDS", 1)
         patch.setattr("service.media.artifacts.COVERAGE_STEPS", 20)
+        small = FilmOptions(width=320, height=180)
+        patch.setattr("service.media.artifacts.film", partial(artifacts.film, options=small))
         result = tandem(
             "pretrain", "--config", config, "--run-dir", home / "run", "--registry", home / "registry",
             "--set", "run.keep_checkpoints=2",

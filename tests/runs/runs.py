@@ -73,7 +73,9 @@ TREE = {
 
 PROCESSES = get_context("forkserver")
 """Begins other processes by forking one that has torch, and no threads of Ray's; each would take 2 s to import it."""
-PROCESSES.set_forkserver_preload(["service.learner.learner"])
+PROCESSES.set_forkserver_preload(
+    ["service.learner.learner", "service.runs.train", "service.base.tensorboard", "tests.runs.runs", "pytest"]
+)
 TINY_TASK = [
     *("--set", "sac.num_worlds=4", "--set", "sac.learning_starts=200", "--set", "sac.hidden_sizes=[8]"),
     *("--set", "sac.batch_size=8", "--set", "sac.gradient_steps=1", "--set", "run.final_episodes=4"),

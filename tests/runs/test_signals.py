@@ -102,6 +102,7 @@ def home(tmp_path, monkeypatch):
     monkeypatch.setattr("service.media.artifacts.NUM_SKILLS", 2)
     monkeypatch.setattr("service.media.artifacts.COVERAGE_STEPS", 2)
     monkeypatch.setattr("service.media.video.write_video", lambda takes, world, path, options: path)
+    monkeypatch.setattr("service.media.artifacts.plot_curves", lambda path, method: path / "curves.png")
     home = SimpleNamespace(path=tmp_path / "run", registry=tmp_path / "registry")
     config = write_yaml(tmp_path / "tiny.yaml")
 
