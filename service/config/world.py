@@ -179,8 +179,8 @@ class WorldConfig(FrozenModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _one_object_is_the_list_of_one(cls, values: Any) -> Any:
-        """And of several what a description leaves out is as of one that is only named."""
+    def _complete_objects(cls, values: Any) -> Any:
+        """Keep a list of one as the one object; give descriptions of several what they leave out, as to a name."""
         objects = values.get("objects") if isinstance(values, Mapping) else None
         if not isinstance(objects, list | tuple) or values.get("object", "cube") != "cube":
             return values
