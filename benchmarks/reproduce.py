@@ -23,8 +23,8 @@ from pathlib import Path
 
 from benchmarks.measuring import ROOT
 from service.base.version import LEARNING_VERSION
+from service.config.task_methods import TASK_METHODS
 from service.envs.tasks import PAPERS
-from service.methods.task_methods import METHODS
 
 PRIMITIVES = {0: "panda-cube@seed-30", 1: "panda-cube@seed-31", 2: "panda-cube@seed-32"}
 """Versions in ``primitives`` by the seed of the trials that take them: each has its own pre-training."""
@@ -130,7 +130,7 @@ def _table(
         *("--set", "run.num_threads=1", *extra),
     )
     versions = out / "primitives" / "models" / reference.partition("@")[0]
-    return Experiment(name, file, METHODS[method].title, task, seed, (command,), versions)
+    return Experiment(name, file, TASK_METHODS[method].title, task, seed, (command,), versions)
 
 
 def _skills(out: Path, seed: int) -> Iterator[Experiment]:

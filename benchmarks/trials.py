@@ -23,10 +23,10 @@ from service.base.version import LEARNING_VERSION, git_commit
 from service.config import Config
 from service.config.load import parse_config
 from service.config.task import TaskConfig
+from service.config.task_methods import find_method
 from service.config.tree import apply_override
 from service.envs.tasks import find_task
 from service.methods.task_evaluation import FINAL_SEED, evaluate_on, numbers_of
-from service.methods.task_methods import find_method
 from service.registry.loading import load
 from service.runs.train import train
 from service.store.run_directory import RunDirectory

@@ -12,9 +12,9 @@ from benchmarks.report.markdown import Row, millions, percent, table
 from benchmarks.report.results import TRIAL, Result, by_method_and_task
 from benchmarks.reproduce import MANY_UPDATES, PAPER_PRIMITIVES, Experiment
 from service.actors.evaluation import wilson_interval
+from service.config.task_methods import TASK_METHODS
 from service.envs.tasks import PAPERS, find_task
 from service.methods.task_evaluation import Rate, rate_of
-from service.methods.task_methods import METHODS
 
 PAPER_EPISODES = 48
 """Of each of the paper's rates, most likely: nearly all are multiples of 1/48, so 16 episodes of three seeds."""
@@ -37,9 +37,9 @@ def comparison_table(results: Sequence[Result], as_paper: Sequence[Result] = ())
     Bold where it is no accident: the paper's interval, Wilson's of 48 episodes, and ours have nothing in common.
     """
     of, of_paper = by_method_and_task(results), by_method_and_task(as_paper)
-    rows = [_compared(METHODS[method].title, method, of) for method in PAPER]
+    rows = [_compared(TASK_METHODS[method].title, method, of) for method in PAPER]
     trained = [method for method in PAPER if any(name == method for name, _ in of_paper)]
-    rows += [_compared(f"{METHODS[method].title}, `{_PAPER_RECIPE}`", method, of_paper) for method in trained]
+    rows += [_compared(f"{TASK_METHODS[method].title}, `{_PAPER_RECIPE}`", method, of_paper) for method in trained]
     return table(("", *(find_task(task).title for task in PAPERS), "our seeds"), rows)
 
 
@@ -53,14 +53,14 @@ def longer_table(results: Sequence[Result], longer: Sequence[Result], more_updat
     of, of_longer, of_many = (by_method_and_task(trials) for trials in (results, longer, more_updates))
     with_many, rows = f", {MANY_UPDATES} updates for 64 env steps", list[Row]()
     for words, trials in (("", of_longer), (with_many, of_many)):
-        for method in METHODS:
+        for method in TASK_METHODS:
             places = [(method, task) for task in tasks]
             if any(place in trials for place in places):
                 cells = (
                     _after(trials.get(place, []), of.get(place, []) if trials is of_longer else None)
                     for place in places
                 )
-                rows.append((METHODS[method].title + words, *cells))
+                rows.append((TASK_METHODS[method].title + words, *cells))
     return table(("", *(find_task(task).title for task in tasks)), rows)
 
 
@@ -75,13 +75,13 @@ def harder_table(results: Sequence[Result]) -> str:
     """Success at the last step on *HardPush* and, of the same seeds, on *Push*: each seed."""
     of = by_method_and_task(results)
     rows: list[Row] = []
-    for method in METHODS:
+    for method in TASK_METHODS:
         hard, plain = (
             {each[TRIAL]["seed"]: each for each in of.get((method, task), [])} for task in ("hard-push", "push")
         )
         if hard:
             rows.append(
-                (METHODS[method].title, each_seed(hard.values()), each_seed(plain[s] for s in hard if s in plain))
+                (TASK_METHODS[method].title, each_seed(hard.values()), each_seed(plain[s] for s in hard if s in plain))
             )
     return table(("", "HardPush", "Push, the same seeds"), rows) if rows else ""
 
@@ -148,7 +148,7 @@ def _mean(seeds: Seeds) -> str:
 
 def learning(takes: str | None) -> list[str]:
     """Names of the methods that learn downstream with what they take, ``"skills"`` for one; None: from nothing."""
-    return [name for name, method in METHODS.items() if method.takes == takes and method.learns]
+    return [name for name, method in TASK_METHODS.items() if method.takes == takes and method.learns]
 
 
 def _mean_distance(trials: Sequence[Result]) -> str:
@@ -182,7 +182,7 @@ def headline_table(results: Sequence[Result]) -> str:
         if found := [name for name in names if name in known]:
             words = f"{title}, the best of up to {len(found)} methods on each task"
             if len(found) == 1:
-                words = title if len(names) == 1 else f"{title}: {METHODS[found[0]].title}"
+                words = title if len(names) == 1 else f"{title}: {TASK_METHODS[found[0]].title}"
             rows.append(
                 (words, *(_best([rates[name, task] for name in found if (name, task) in rates]) for task in PAPERS))
             )

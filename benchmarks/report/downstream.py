@@ -15,10 +15,10 @@ from benchmarks.run_files import steps_until
 from service.base.errors import TandemError
 from service.base.files import write_atomic
 from service.base.version import LEARNING_VERSION
+from service.config.task_methods import TASK_METHODS
 from service.envs.tasks import PAPERS, TASKS, find_task
 from service.media.figures import BLUE, FAINT, GREEN, ORANGE, new_figure, save, style_axes
 from service.methods.task_evaluation import rate_of
-from service.methods.task_methods import METHODS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -138,7 +138,7 @@ def methods_table(
 ) -> str:
     """A row per method that has a result, and a text per task; below it, if asked for, the paper's."""
     rows: list[Row] = []
-    for method, described in METHODS.items():
+    for method, described in TASK_METHODS.items():
         found = [of.get((method, task), []) for task in tasks]
         if any(found):
             rows.append((described.title, *(text(seeds) if seeds else "" for seeds in found)))
@@ -179,12 +179,12 @@ def _cost(seeds: Seeds) -> str:
 
 def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
     """The section on how soon methods that compose are good, and the first that learns from nothing is as good."""
-    known = {name: method for name, method in METHODS.items() if any(found == name for found, _ in of)}
+    known = {name: method for name, method in TASK_METHODS.items() if any(found == name for found, _ in of)}
     composing = [name for name, method in known.items() if method.composes]
     scratch = [name for name, method in known.items() if method.learns and method.takes is None]
     rows = []
     for method in composing:
-        own, others = [METHODS[method].title], ["*best from scratch*"]
+        own, others = [TASK_METHODS[method].title], ["*best from scratch*"]
         for task in PAPERS:
             seeds = of.get((method, task), [])
             level = FINAL_SHARE * float(np.mean([each["evaluation"]["success_last"] for each in seeds] or [0.0]))
@@ -216,7 +216,7 @@ def _soonest(of: Mapping[str, Seeds], level: float) -> str:
         longest = max(result["env_steps"] for seeds in of.values() for result in seeds)
         return f"> {longest / 1e3:.0f} ({len(of)})"
     first = min(reached, key=lambda name: reached[name])
-    return f"{reached[first] / 1e3:.0f}, {METHODS[first].title} ({len(of)})"
+    return f"{reached[first] / 1e3:.0f}, {TASK_METHODS[first].title} ({len(of)})"
 
 
 def _origin(results: Sequence[Result]) -> str:
@@ -246,7 +246,7 @@ def draw_table(results: Sequence[Result], path: Path) -> Path:
     for axes in panels[len(tasks) :]:
         axes.set_axis_off()
     for axes, name in zip(panels, tasks, strict=False):
-        for method, described in METHODS.items():
+        for method, described in TASK_METHODS.items():
             if (method, name) in of:
                 lines[described.title] = _draw_method(axes, of[method, name], *styles[method])
         style_axes(axes)
@@ -254,7 +254,7 @@ def draw_table(results: Sequence[Result], path: Path) -> Path:
         axes.set_xlabel("env steps, thousands", color=FAINT, fontsize=9)
         axes.set_ylim(-0.02, 1.02)
         axes.set_xlim(0.0, 1.02 * longest or 1.0)
-    titles = [described.title for described in METHODS.values() if described.title in lines]
+    titles = [described.title for described in TASK_METHODS.values() if described.title in lines]
     anchor = (0.015, 1 - 0.5 / height_inch)  # under the title
     figure.legend(
         [lines[title] for title in titles],
@@ -273,8 +273,8 @@ def draw_table(results: Sequence[Result], path: Path) -> Path:
 
 def _line_styles() -> dict[str, tuple[str, str]]:
     """Colour and dashes of each method: those with skills have dashes, and the colours again."""
-    drawn = [name for name, method in METHODS.items() if method.takes != "skills"]
-    dashed = [name for name in METHODS if name not in drawn]
+    drawn = [name for name, method in TASK_METHODS.items() if method.takes != "skills"]
+    dashed = [name for name in TASK_METHODS if name not in drawn]
     return {
         name: (colour, style)
         for names, style in ((drawn, "-"), (dashed, "--"))

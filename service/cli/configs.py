@@ -13,6 +13,7 @@ from service.base.user_code import parse_reference
 from service.cli.common import CommandGroup, JsonOption, print_json, print_table
 from service.config.find import METHODS, find_class
 from service.config.recipes import DEFAULT_RECIPE, first_comment, recipes, robots
+from service.config.task_methods import TASK_METHODS
 from service.envs.tasks import TASKS, find_task
 
 configs_app = typer.Typer(name="configs", help="Recipes and robots that come with tandem.", cls=CommandGroup)
@@ -34,11 +35,9 @@ def named(what: str | None, method: str | None, primitives: str | None) -> tuple
     Raises:
         TandemError: no such recipe, task or file; or options that mean nothing there.
     """
-    from service.methods.task_methods import METHODS as OF_TASKS
-
     known = targets()
     if what is not None and is_task(what):
-        if method in OF_TASKS and method not in METHODS:
+        if method in TASK_METHODS and method not in METHODS:
             raise TandemError(f"{method} learns nothing: measure it by tandem evaluate --task {what} --method {method}")
         chosen = {"task": what, "method": method or "ours"} | ({} if primitives is None else {"primitives": primitives})
         # as JSON, which is YAML: a name may look like a number or a date
@@ -47,7 +46,7 @@ def named(what: str | None, method: str | None, primitives: str | None) -> tuple
         raise TandemError("--primitives is for learning a task: name one, such as push; a run begins from --from")
     if what is None:
         recipe = recipes().get(f"{DEFAULT_RECIPE}-{method}")
-        if recipe is None and method in OF_TASKS:
+        if recipe is None and method in TASK_METHODS:
             raise TandemError(f"--method {method} is for a task: name one, such as tandem train push")
         return recipe, [f"method={method}"] if method is not None and recipe is None else []
     if what not in known and not Path(what).suffix and not Path(what).exists():
@@ -74,13 +73,11 @@ def list_configs(context: typer.Context, as_json: JsonOption = False) -> None:
 
 def methods(as_json: JsonOption = False) -> None:
     """List the methods by which a run learns, and those of tandem evaluate, which learn nothing."""
-    from service.methods.task_methods import METHODS as OF_TASKS
-
     rows = []
-    for name in [*METHODS, *(each for each in OF_TASKS if each not in METHODS)]:
-        if name in OF_TASKS:
+    for name in [*METHODS, *(each for each in TASK_METHODS if each not in METHODS)]:
+        if name in TASK_METHODS:
             what = "a task" if name in METHODS else "nothing"
-            rows.append({"name": name, "learns": what, "about": OF_TASKS[name].description})
+            rows.append({"name": name, "learns": what, "about": TASK_METHODS[name].description})
         else:
             about = (find_class(name, {}).__doc__ or "").partition("\n")[0]
             rows.append({"name": name, "learns": "pre-training", "about": about.rstrip(".")})

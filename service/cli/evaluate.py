@@ -30,6 +30,7 @@ from service.cli.common import (
 )
 from service.config import WorldConfig, changed_config
 from service.config.find import METHODS
+from service.config.task_methods import TASK_METHODS, find_method
 from service.envs.observations import each_object, layouts
 from service.store.run_directory import encode_result
 
@@ -157,13 +158,13 @@ def evaluate(
 def _players(trained: Trained, method: str | None) -> dict[str, DeterministicPolicy]:
     """The policies that are measured, by name."""
     from service.actors.evaluation import IdlePolicy
-    from service.methods.task_methods import find_method
+    from service.methods.task_check import check_fits
 
     players: dict[str, DeterministicPolicy] = {}
     if method in METHODS:
         raise TandemError(f"--method {method} learns: tandem train TASK --method {method}, then evaluate that run")
     if method is not None:
-        find_method(method).check(trained)
+        check_fits(find_method(method), trained)
     if method != "idle":
         players[trained.label] = trained.expect_goals("tandem evaluate").player()
     bob = trained.trained
@@ -174,10 +175,8 @@ def _players(trained: Trained, method: str | None) -> dict[str, DeterministicPol
 
 def _write_result(path: Path, trained: Trained, method: str | None, seed: int, numbers: Metrics) -> None:
     """Write a file that says what a run's configuration and result say."""
-    from service.methods.task_methods import METHODS as OF_TASKS
-
     method = method or ("asp-only" if trained.kind == "primitives" else f"{trained.skills.method}-zero-shot")
-    takes = method not in OF_TASKS or OF_TASKS[method].takes is not None
+    takes = method not in TASK_METHODS or TASK_METHODS[method].takes is not None
     result: dict[str, JsonValue] = {
         "task": None if trained.task is None else trained.task.name,
         "method": method,

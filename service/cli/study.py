@@ -15,6 +15,7 @@ from service.cli.configs import is_task, named
 from service.config import Config, load_config
 from service.config.find import METHODS
 from service.config.recipes import DEFAULT_RECIPE, recipes
+from service.config.task_methods import TASK_METHODS
 from service.envs.tasks import PAPERS
 from service.registry.names import is_service
 from service.runs.grid import SEED, Settings, check_once, name_runs, parse_grid
@@ -158,13 +159,11 @@ def _plan(
 
     ``default`` is the file of runs for which none is named.
     """
-    from service.methods.task_methods import METHODS as OF_TASKS
-
     given = parse_grid(grid, seeds)
     whats, methods = _words(what), _words(method)
     whats = list(PAPERS) if whats == ["all"] else whats
     if methods == ["all"]:  # skills are other commands, each with its own --primitives
-        methods = [name for name, how in OF_TASKS.items() if name in METHODS and how.takes != "skills"]
+        methods = [name for name, how in TASK_METHODS.items() if name in METHODS and how.takes != "skills"]
     kind = "task" if all(map(is_task, whats)) else "recipe"
     several = {key: words for key, words in ((kind, whats), ("method", methods)) if len(words) > 1}
     for key, word, words in ((kind, what, whats), ("method", method, methods)):

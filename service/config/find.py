@@ -8,25 +8,13 @@ from collections.abc import Mapping
 from service.base import user_code
 from service.base.errors import ConfigError, did_you_mean
 from service.config.run import Config
+from service.config.task_methods import TASK_METHODS
 
-_TASK = "service.config.task:TaskConfig"
 METHODS: Mapping[str, str] = {
     "self-play": "service.config.self_play:SelfPlayConfig",
     "skills": "service.config.skills:SkillDiscoveryConfig",
     "distillation": "service.config.distillation:DistillingConfig",
-    "ours": _TASK,
-    "ours-her": _TASK,
-    "ours-residual-her": _TASK,
-    "scratch-monolithic-her": _TASK,
-    "scratch-mcp-her": _TASK,
-    "scratch-monolithic": _TASK,
-    "scratch-mcp": _TASK,
-    "lsd": _TASK,
-    "dads": _TASK,
-    "diayn": _TASK,
-    "metra": _TASK,
-    "csf": _TASK,
-    "any-skills": _TASK,
+    **{name: "service.config.task:TaskConfig" for name, method in TASK_METHODS.items() if method.learns},
 }
 """Where the class of each method is, as ``MODULE:CLASS``; it is imported when it is needed."""
 

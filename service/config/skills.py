@@ -20,8 +20,8 @@ ZeroShot = Literal["way", "place", "none"]
 
 SKILLS_OF: Mapping[str, tuple[Prior, ZeroShot]] = {
     "lsd": ("normal", "way"),
-    "diayn": ("normal", "place"),
     "dads": ("uniform", "none"),
+    "diayn": ("normal", "place"),
     "metra": ("sphere", "way"),
     "csf": ("sphere", "way"),
 }

@@ -12,9 +12,9 @@ from pydantic import Field, model_validator
 from service.base.errors import ConfigError
 from service.base.user_code import parse_reference
 from service.config.run import SUCCESS_DISTANCE_M, Config, RunConfig
-from service.config.skills import SKILLS_OF, SACConfig
+from service.config.skills import SACConfig
+from service.config.task_methods import TASK_METHODS
 
-_TAKE_SKILLS = (*SKILLS_OF, "any-skills")
 _UNUSED_SKILL_STEPS = (1, 5)
 """What configurations of other methods say: the default, and the one of earlier versions."""
 
@@ -69,7 +69,12 @@ class TaskConfig(Config):
     @property
     def hold_steps(self) -> int:
         """Env steps that an action of the learner lasts."""
-        return self.skill_steps if self.method in _TAKE_SKILLS else 1
+        return self.skill_steps if self._takes_skills else 1
+
+    @property
+    def _takes_skills(self) -> bool:
+        method = TASK_METHODS.get(self.method)
+        return method is not None and method.takes == "skills"
 
     def as_in(self, saved: Self) -> Self:
         """The same, with the exact version of the primitives and their world, where these may be those of ``saved``."""
@@ -111,7 +116,7 @@ class TaskConfig(Config):
             raise ValueError(
                 f"skill_steps {self.skill_steps}: an episode has {self.episode_steps} steps; hold it shorter"
             )
-        if self.skill_steps not in _UNUSED_SKILL_STEPS and self.method not in _TAKE_SKILLS:
+        if self.skill_steps not in _UNUSED_SKILL_STEPS and not self._takes_skills:
             raise ValueError(f"skill_steps is for methods that take skills, and {self.method} takes none: leave it out")
         if self.method.endswith("-her") and length_known and starts < episodes:
             raise ValueError(

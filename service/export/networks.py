@@ -9,8 +9,8 @@ from functools import cached_property, partial
 import numpy as np
 
 from service.base.types import FloatArray
+from service.config.task_methods import find_method
 from service.envs.observations import ObservationLayout, layouts
-from service.methods.task_methods import find_method
 from service.policies.forward import FUNCTIONS
 from service.policies.numpy_actor import STEP_SCALE_M, numpy_actor
 from service.policies.numpy_policy import NumpyMCPPolicy, NumpyPolicy

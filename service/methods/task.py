@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.vector import VectorEnv
 from pydantic import ValidationError
 
 from service.actors.evaluation import DeterministicPolicy, Evaluation
@@ -22,21 +23,23 @@ from service.config.frozen import first_error
 from service.config.run import SUCCESS_DISTANCE_M
 from service.config.self_play import MCPConfig, SelfPlayConfig
 from service.config.task import TaskConfig
+from service.config.task_methods import TaskMethod, find_method
 from service.config.world import WorldConfig
 from service.envs.gym.vector import TabletopVectorEnv
+from service.envs.observations import layouts
 from service.envs.task import Task
 from service.envs.tasks import find_task
 from service.learner.off_policy import OffPolicyLoop
 from service.learner.replay import ReplayBuffer
 from service.learner.sac import Batch, SACLearner
 from service.learner.sac_networks import GaussianActor, MCPActor
+from service.methods.compose import ComposePrimitivesVector
 from service.methods.method import Iteration, Method, State
-from service.methods.task_check import check_task
+from service.methods.task_check import check_fits, check_task
 from service.methods.task_evaluation import CURVE_SEED, FINAL_SEED, evaluate_on, numbers_of
-from service.methods.task_methods import TaskMethod, find_method
-from service.methods.task_worlds import TaskWorlds, columns
+from service.methods.task_worlds import SkillTaskWorlds, TaskWorlds, columns
 from service.policies.parameters import Parameters
-from service.registry.learned import learner_inputs, num_inputs
+from service.registry.learned import RESIDUAL, learner_inputs, num_inputs
 from service.registry.loading import Trained, learned_policy, load
 
 _RELABELLED_UNTIL = 0.5
@@ -57,7 +60,7 @@ class TaskLearning(Method):
     def __init__(self, config: TaskConfig, acts_with: Trained) -> None:
         super().__init__()
         self._how = find_method(config.method)
-        self._how.check(acts_with)
+        check_fits(self._how, acts_with)
         if config.primitives_digest not in (None, acts_with.digest):
             raise TandemError(
                 f"{acts_with.label} has other parameters than the {config.primitives} that this run began with: name "
@@ -133,15 +136,20 @@ class TaskLearning(Method):
         return {f"rollout/{name}": float(value) for name, value in means.items()}
 
     def _make_worlds(self) -> TaskWorlds:
-        config = self.config
-        env = TabletopVectorEnv(
+        """The worlds that the learner acts in: by itself, by weights of primitives, or by skills."""
+        config, acts_with, seed = self.config, self._acts_with, spread_seed(self.config.seed, 3)
+        env: VectorEnv[Any, Any, Any] = TabletopVectorEnv(
             config.sac.num_worlds,
             config.world,
             task=self._task,
             success_distance_m=SUCCESS_DISTANCE_M - config.reward_margin_m,
             num_threads=config.run.num_threads,
         )
-        return self._how.enter(env, spread_seed(config.seed, 3), self._acts_with, config.hold_steps)
+        if self._how.takes == "skills":
+            return SkillTaskWorlds(env, seed, acts_with.skills, config.hold_steps)
+        if self._how.composes:
+            env = ComposePrimitivesVector(env, acts_with, residual=RESIDUAL if self._how.adds_action else 0.0)
+        return TaskWorlds(env, seed, layouts(acts_with.config.world))
 
 
 class Hindsight:
@@ -242,7 +250,7 @@ def begin(config: TaskConfig, registry: Path | str, start_from: Trained | None) 
     found, how = load(config.primitives, registry), find_method(config.method)
     if config.world not in (WorldConfig(), found.config.world):
         raise ConfigError("world: a task is learned in the world of its primitives; leave out world")
-    how.check(found)
+    check_fits(how, found)
     task = find_task(config.task, config.code, config.task_world)
     found.playing(task)  # is refused where it has not as many objects
     check_task(task, found.config.world, relabels=how.her_ratio is not None)

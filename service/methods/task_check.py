@@ -1,4 +1,4 @@
-"""Tries a task of a user's before anything is learned: its functions run, and success comes and goes."""
+"""Checks before a task is learned: the method takes what was named, and a user's task runs, and can be solved."""
 
 from __future__ import annotations
 
@@ -6,18 +6,42 @@ import logging
 
 import numpy as np
 
-from service.base.errors import ConfigError
+from service.base.errors import ConfigError, TandemError
 from service.base.types import BoolArray
 from service.base.user_code import CodeError, place_of
 from service.config import WorldConfig
+from service.config.task_methods import TaskMethod
 from service.envs.batch import WorldBatch
 from service.envs.objects import object_names
 from service.envs.observations import ACTION, each_object
 from service.envs.rules import Rules
 from service.envs.task import Task, View
+from service.methods.compose import check_primitives, check_robot
+from service.registry.loading import Trained
 
 _NUM_WORLDS = 64
 _logger = logging.getLogger(__name__)
+
+
+def check_fits(method: TaskMethod, trained: Trained) -> None:
+    """Check that these primitives or skills are for this method.
+
+    Raises:
+        TandemError: of another kind, robot or layout, skills of another method, or primitives that cannot be composed.
+    """
+    if method.takes == "skills" and trained.kind != "skills":
+        name = method.skills or "lsd"
+        raise TandemError(
+            f"the method {method.title} needs skills, and {trained.label} has none: name some by --primitives, such "
+            f"as panda-cube-{name}@latest, which tandem train --method {name} makes"
+        )
+    if method.takes is not None:
+        trained.expect(method.takes, by=f"the method {method.title}")
+    check_robot(trained)
+    if method.composes:
+        check_primitives(trained)
+    if method.skills is not None and (found := trained.skills.method) != method.skills:
+        raise TandemError(f"{trained.label} holds skills of {found}, this method takes those of {method.skills}")
 
 
 def check_task(task: Task, world: WorldConfig, *, relabels: bool = False) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from service.config.skills import SKILLS_OF
+from service.config.task_methods import TASK_METHODS
 from service.registry.manifest import Manifest
 
 LICENCE = "apache-2.0"
@@ -136,7 +137,7 @@ def _kind(manifest: Manifest) -> tuple[str, str, str, list[str]]:
     after = "In place of the name, the folder that `tandem registry export` has written will do."
     if spaces.get("kind") == "orchestrator":
         method, frozen = str(spaces.get("method", "")), spaces.get("primitives", "?")
-        skilled = method in (*SKILLS_OF, "any-skills")
+        skilled = method in TASK_METHODS and TASK_METHODS[method].takes == "skills"
         takes, how = ("skills", [method] * (method in PAPERS)) if skilled else ("primitives", ["self-play", "mcp"])
         return (
             f"An orchestrator of Tandem: a policy for the task *{spaces.get('task', '?')}* that acts with the frozen "

@@ -18,6 +18,7 @@ from zlib import crc32
 from service.base.errors import TandemError
 from service.base.parsing import parse_json
 from service.base.version import LEARNING_VERSION
+from service.config.task_methods import TASK_METHODS
 from service.config.tree import leaves, read_yaml
 from service.status.schemas import TaskCell, TaskColumn, TaskRow, TaskTable
 from service.store.models import RunStatus, Trial
@@ -54,7 +55,6 @@ def task_table(statuses: Iterable[RunStatus], directories: Mapping[str, Path]) -
         directories: of the runs that are on this machine, by their ids.
     """
     from service.envs.tasks import TASKS, find_task
-    from service.methods.task_methods import METHODS  # with MuJoCo and Gymnasium, which few views need
 
     runs, problems = list[_Run](), list[str]()
     for status in statuses:
@@ -71,7 +71,7 @@ def task_table(statuses: Iterable[RunStatus], directories: Mapping[str, Path]) -
     columns = sorted({run.column for run in runs}, key=lambda column: (*_place(column[0], TASKS), column[1]))
     values = _values(runs)
     rows = [(_first(row).trial, row) for row in _rows(runs)]
-    rows.sort(key=lambda row: (*_place(row[0].method, METHODS), str(row[0].primitives)))
+    rows.sort(key=lambda row: (*_place(row[0].method, TASK_METHODS), str(row[0].primitives)))
     return TaskTable(
         tasks=tuple(
             TaskColumn(task=task, version=version, title=find_task(task).title if task in TASKS else task)
@@ -80,7 +80,7 @@ def task_table(statuses: Iterable[RunStatus], directories: Mapping[str, Path]) -
         rows=tuple(
             TaskRow(
                 method=trial.method,
-                title=METHODS[trial.method].title if trial.method in METHODS else trial.method,
+                title=TASK_METHODS[trial.method].title if trial.method in TASK_METHODS else trial.method,
                 primitives=trial.primitives,
                 primitives_digest=trial.primitives_digest,
                 cells=tuple(_cell(row[column], values[_first(row).made]) for column in columns if column in row),

@@ -10,15 +10,15 @@ from benchmarks.trials import trial_config
 from service.cli.main import app
 from service.config import load_config
 from service.config.recipes import recipes
+from service.config.task_methods import TASK_METHODS
 from service.envs.tasks import PAPERS
-from service.methods.task_methods import METHODS
 
 
 def test_every_method_is_run_on_every_task_with_three_seeds(tmp_path):
     everything = list(experiments(tmp_path))
     names = [each.name for each in everything]
     assert len(set(names)) == len(names) == len({each.file for each in everything})
-    methods = [method for method in METHODS if not method.startswith(("csf", "any-", "ours-residual"))]
+    methods = [method for method in TASK_METHODS if not method.startswith(("csf", "any-", "ours-residual"))]
     cells = {f"downstream/{task}-{method}-{seed}" for task in PAPERS for method in methods for seed in range(3)}
     cells |= {f"downstream/push-ours-residual-her-{seed}" for seed in range(3)}
     assert cells <= set(names)

@@ -5,9 +5,9 @@ import torch
 from service.config import RunConfig, WorldConfig
 from service.config.self_play import MCPConfig, MLPConfig, PolicyConfig, SelfPlayConfig
 from service.config.task import TaskConfig
+from service.config.task_methods import TASK_METHODS
 from service.envs.observations import layouts
 from service.learner.sac_networks import GaussianActor
-from service.methods.task_methods import METHODS
 from service.policies.networks import export_parameters, make_bob
 from service.registry.learned import num_inputs
 from service.registry.loading import load
@@ -43,10 +43,10 @@ def parameters_of(config):
 
 def actor_of(method, seen=SEEN):
     """Of a policy of a task; it sets the weights of Bob's primitives, or acts by itself."""
-    composed = BOB.num_primitives if METHODS[method].composes else 4
+    composed = BOB.num_primitives if TASK_METHODS[method].composes else 4
     with torch.random.fork_rng():
         torch.manual_seed(4)
-        actor = GaussianActor(num_inputs(seen)[1], composed + (4 if METHODS[method].residual else 0), (16, 12))
+        actor = GaussianActor(num_inputs(seen)[1], composed + (4 if TASK_METHODS[method].residual else 0), (16, 12))
         return scattered(actor)
 
 
@@ -63,7 +63,7 @@ def write_training(path, trained, method="ours-residual-her", task="push"):
         task=task,
         world=trained.config.world,
         primitives=trained.reference,
-        primitives_digest=trained.digest if METHODS[method].takes else None,
+        primitives_digest=trained.digest if TASK_METHODS[method].takes else None,
     )
     return write_run(path, config, actor_of(method))
 

@@ -8,10 +8,11 @@ import torch
 
 import service
 from service.base.errors import TandemError
+from service.config.task_methods import TASK_METHODS
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.observations import POSITIONS
 from service.methods.task import TaskLearning
-from service.methods.task_methods import METHODS
+from service.methods.task_check import check_fits
 from service.methods.task_worlds import SkillTaskWorlds, TaskWorlds
 from service.policies.frozen_skills import ZeroShotPolicy
 from service.registry.publishing import publish
@@ -123,13 +124,13 @@ class TestBadInput:
 
     def test_skills_and_primitives_where_the_other_is_expected(self, champion):
         with pytest.raises(TandemError, match=r"made@1 is a set of skills of lsd; the method ours needs primitives"):
-            METHODS["ours"].check(made())
+            check_fits(TASK_METHODS["ours"], made())
         with pytest.raises(TandemError, match=r"the method LSD skills needs skills, and panda-cube@.* has none"):
-            METHODS["lsd"].check(champion)
+            check_fits(TASK_METHODS["lsd"], champion)
 
     def test_skills_of_another_method(self):
         with pytest.raises(TandemError, match=r"made@1 holds skills of dads, this method takes those of lsd"):
-            METHODS["lsd"].check(made("dads"))
+            check_fits(TASK_METHODS["lsd"], made("dads"))
 
     def test_skills_of_another_robot(self, registry):
         trained = service.load("made", registry)
@@ -138,7 +139,7 @@ class TestBadInput:
         with pytest.raises(
             TandemError, match=r"made@1 is for another robot or layout: action 7; this one has action 4"
         ):
-            METHODS["lsd"].check(other)
+            check_fits(TASK_METHODS["lsd"], other)
 
     def test_another_size_of_z(self, skills):
         rows = np.zeros((NUM, POSITIONS.size), dtype=np.float32)

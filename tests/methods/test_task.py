@@ -12,11 +12,11 @@ from service.actors.evaluation import IdlePolicy, evaluate
 from service.base.errors import TandemError
 from service.config.find import METHODS as KNOWN
 from service.config.task import TaskConfig
+from service.config.task_methods import TASK_METHODS
 from service.envs.observations import layouts
 from service.envs.tasks import find_task
 from service.methods import task_evaluation
 from service.methods.task import TaskLearning
-from service.methods.task_methods import METHODS
 from service.registry.bundled import BUNDLED
 from service.registry.loading import network_problems
 from service.registry.publishing import publish
@@ -343,6 +343,6 @@ def test_there_is_no_beginning_from_another_policy(champion):
 
 
 def test_the_methods_of_the_table_that_learn_are_those_of_configurations():
-    assert {name for name, row in METHODS.items() if row.learns} == {
+    assert {name for name, row in TASK_METHODS.items() if row.learns} == {
         name for name, place in KNOWN.items() if place.endswith(TaskConfig.__name__)
     }

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
+from service.config.task_methods import TASK_METHODS
 from service.methods.task import TaskLearning
-from service.methods.task_methods import METHODS
 from tests.methods.trials import small_trial
 
 
@@ -14,7 +14,7 @@ def test_a_learned_policy_acts_as_in_its_worlds(champion, method):
     loop = training.loop
     loop.play(400)
     player = training.player()
-    inner = loop.worlds.env.env if METHODS[method].composes else loop.worlds.env
+    inner = loop.worlds.env.env if TASK_METHODS[method].composes else loop.worlds.env
     handed, step = [], inner.step
     inner.step = lambda actions: handed.append(actions) or step(actions)
     loop.worlds.env.reset(seed=3)
