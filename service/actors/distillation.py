@@ -20,6 +20,8 @@ from service.policies.numpy_policy import NumpyMCPPolicy
 
 _LEAST_LOG_WEIGHT = np.log(0.01)
 """Random weights are from here to 0 on a logarithmic scale, as those of an orchestrator."""
+_HOLD_STEPS = 5
+"""Env steps for which random weights are held."""
 _NOISY_SHARE = 0.5
 
 
@@ -110,7 +112,7 @@ class DistillationWorlds:
         observation = bob_observation(positions, goal)
         means, variances = self._teacher.primitives(true)
         answer = Lesson(observation, means, variances, self._teacher.gate(bob_observation(true, goal)))
-        if step % how.random_hold_steps == 0:
+        if step % _HOLD_STEPS == 0:
             shape = worlds.num_worlds, student.num_primitives
             self._weights = np.exp(rng.uniform(_LEAST_LOG_WEIGHT, 0.0, shape)).astype(np.float32)
         weights = np.where(composed[:, None], self._weights, student.gate(observation))

@@ -27,14 +27,12 @@ class DistillationConfig(FrozenModel):
         description="share of episodes in which random weights compose the primitives: what is composed downstream "
         "goes where Bob himself does not",
     )
-    random_hold_steps: int = Field(5, ge=1, description="env steps for which such weights are held")
     action_noise: float = Field(
         0.3, ge=0.0, le=1.0, description="std of noise on every second action of a world: it leaves the usual path"
     )
     gradient_steps: int = Field(40, ge=1, description="after an episode of every world")
     batch_size: int = Field(1024, ge=1)
     learning_rate: float = Field(1e-3, gt=0.0, description="falls to a fiftieth, linearly")
-    gate_weight: float = Field(0.1, ge=0.0, description="of the gate's error, beside those of actions and primitives")
     ema_decay: float = Field(
         0.9, ge=0.0, lt=1.0, description="what is evaluated and published is a moving average over iterations"
     )

@@ -190,7 +190,6 @@ class PPOConfig(FrozenModel):
     )
     dual_clip: float = Field(3.0, gt=1.0, description="bound of the surrogate for negative advantages (Ye et al. 2020)")
     entropy_weight: float = Field(0.001, ge=0.0)
-    value_weight: float = Field(1.0, ge=0.0)
     num_epochs: int = Field(3, ge=1)
     minibatch_size: int = Field(3200, ge=2)
     max_grad_norm: float = Field(0.5, gt=0.0)

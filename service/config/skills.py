@@ -84,20 +84,13 @@ class SkillsConfig(FrozenModel):
     learning_rate: float = Field(3e-4, gt=0.0, description="of that network; LSD's code 3e-5, METRA's 1e-4, DADS' 3e-4")
     gradient_steps: int = Field(2, ge=1, description="of that network after a step of every world")
     batch_size: int = Field(256, ge=2)
-    reward_scale: float = Field(1.0, gt=0.0)
     newest_steps: int = Field(
         1_000_000,
         ge=1,
         description="env steps that the network learns from: the newest of those kept; DADS' code has 10,000",
     )
-    variance_floor: float = Field(
-        1e-3,
-        gt=0.0,
-        description="DADS: added to the variances by which it normalises, as its code's batch normalisation does",
-    )
     num_alternatives: int = Field(100, ge=1, description="DADS: skills that each one is compared with")
     dual_initial: float = Field(30.0, gt=0.0, description="METRA: first value of the dual variable")
-    dual_slack: float = Field(1e-3, gt=0.0, description="METRA: of its constraint")
     replay_steps: int = Field(1_000_000, ge=1, description="env steps that are kept to learn from")
     sac: SkillsSACConfig = SkillsSACConfig()
 

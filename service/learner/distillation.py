@@ -18,6 +18,8 @@ from service.policies.forward import compose
 
 _ADAM_EPSILON = 1e-8
 _MAX_GRAD_NORM = 1.0
+_GATE_WEIGHT = 0.1
+"""Of the gate's error, beside those of actions and primitives."""
 _LAST_RATE = 0.02
 """Share of the learning rate at the end."""
 
@@ -56,7 +58,7 @@ class Distiller:
         for _ in range(self.config.gradient_steps):
             rows = torch.from_numpy(rng.integers(len(lesson.observation), size=self.config.batch_size))
             errors = self.errors(*(column[rows] for column in columns))
-            loss = errors[0] + errors[1] + self.config.gate_weight * errors[2]
+            loss = errors[0] + errors[1] + _GATE_WEIGHT * errors[2]
             self.student.zero_grad()
             loss.backward()
             clip_grad_norm_(list(self._parameters.values()), _MAX_GRAD_NORM)

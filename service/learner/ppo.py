@@ -243,7 +243,7 @@ def _step(
             losses, scalars = [policy_loss], of_policy
     if samples is not None:
         scalars["value_loss"] = value_loss(player.value(samples.value_observation), samples.value_target)
-        losses.append(config.value_weight * scalars["value_loss"])
+        losses.append(scalars["value_loss"])
     loss = torch.stack(losses).sum()
     player.policy.zero_grad()
     player.value.zero_grad()

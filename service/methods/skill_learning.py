@@ -129,7 +129,6 @@ class IntrinsicBatches:
         rows = replay.read(replay.draw(size, rng))
         seen = self._see(rows)
         paid: FloatArray = self.reward.rewards(*_tensors(seen, rows["skill"], jumps=self.reward.pays_jumps)).numpy()
-        paid = np.float32(self._config.reward_scale) * paid
         weights = rows["skill"] if self.reward.pays_features else None
         return Batch(seen.inputs, rows["action"], paid, seen.next_inputs, weights)
 

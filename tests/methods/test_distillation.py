@@ -101,11 +101,11 @@ def test_a_student_acts_with_noise_at_some_steps():
 
 
 def test_random_weights_are_held():
-    how = {"num_worlds": 64, "random_fraction": 0.9, "action_noise": 0.0, "random_hold_steps": 3}
+    how = {"num_worlds": 64, "random_fraction": 0.9, "action_noise": 0.0, "episode_steps": 10}
     config = config_of({}, how)
     student = acting_student(config)
     observation, actions, worlds = played_actions(config, student)
-    for step in (3, 4, 5):  # of six; the weights of the last three are still there
+    for step in range(5, 10):  # of ten; the weights of the last five are still there
         expected, _ = student.compose(observation[step][:, : layouts(config.world).positions.size], worlds._weights)
         random = np.isclose(actions[step], expected, atol=1e-6).all(axis=1)
         assert random.mean() == pytest.approx(0.9, abs=3 * np.sqrt(0.9 * 0.1 / 64))

@@ -17,6 +17,8 @@ _CLIP = 50.0
 """Of the difference of two log-probabilities (its code)."""
 _MOMENT_DECAY = 0.99
 """Weight that a batch's moments keep from one update to the next, in the normalisation."""
+_VARIANCE_FLOOR = 1e-3
+"""Added to the variances by which it normalises, as its code's batch normalisation does."""
 
 
 class DADS(IntrinsicReward):
@@ -48,7 +50,7 @@ class DADS(IntrinsicReward):
 
     def _normalised(self, name: str, values: Tensor) -> Tensor:
         mean, square = self._moments[f"{name}_mean"], self._moments[f"{name}_square"]
-        return (values - mean) / (square - mean.square() + self.config.variance_floor).sqrt()
+        return (values - mean) / (square - mean.square() + _VARIANCE_FLOOR).sqrt()
 
     def _log_prob(self, before: Tensor, change: Tensor, skill: Tensor) -> Tensor:
         """(...,) but for a constant, at normalised (..., S) states and changes and (..., Z) skills."""

@@ -12,6 +12,9 @@ from typing_extensions import override
 from service.config.skills import Prior, SkillsConfig
 from service.methods.intrinsic_reward import IntrinsicReward, along
 
+_SLACK = 1e-3
+"""Of the constraint (its code)."""
+
 
 class METRA(IntrinsicReward):
     """As LSD with z on the unit sphere, where a step in phi has a mean square of at most 1 (Park et al. 2024).
@@ -28,7 +31,7 @@ class METRA(IntrinsicReward):
     @override
     def loss(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
         step: Tensor = self.network(after) - self.network(before)
-        room = (1.0 - step.square().mean(dim=1)).clamp(max=self.config.dual_slack)
+        room = (1.0 - step.square().mean(dim=1)).clamp(max=_SLACK)
         # One gradient step for both: phi goes up on rewards and on room, the dual down where there is room.
         ascent = along(step, skill) + self._log_dual.exp().detach() * room
         return -ascent.mean() + self._log_dual * room.detach().mean()
