@@ -24,9 +24,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from benchmarks.report.markdown import table
 from service.base.errors import TandemError
 from service.base.files import write_atomic
+from service.base.markdown import table
 from service.base.version import git_commit
 from service.registry.loading import Trained, load
 

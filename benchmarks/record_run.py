@@ -24,13 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.measuring import machine, one_line_errors, write_json
-from benchmarks.run_files import CELL_SIZE_M, COUNTERS, FORMAT_VERSION, RANDOM, STAGES, Records, Run, blocks, thin
+from benchmarks.run_files import COUNTERS, FORMAT_VERSION, RANDOM, STAGES, Records, Run, blocks, thin
 from service.actors.coverage import NUM_SKILLS, RandomPolicy, skill_paths, skill_trajectories, visited_share
 from service.actors.evaluation import DeterministicPolicy, IdlePolicy, evaluate
 from service.base.errors import TandemError
 from service.base.tensors import split_parts
 from service.base.types import StateArray
 from service.config import Config, WorldConfig
+from service.config.run import CELL_SIZE_M
 from service.config.skills import SkillDiscoveryConfig
 from service.envs.task import EPISODE_STEPS, Task
 from service.envs.tasks import find_task
@@ -252,7 +253,7 @@ def _measure_sets(play: _Player, config: Config, num_sets: int) -> dict[str, Any
     sets = [play(seed=seed) for seed in range(num_sets)]
     kept = np.round(1000 * sets[0][:, ::KEPT_EVERY]).astype(int)
     return {
-        "shares": [round(visited_share(paths, config.world.workspace, cell_size_m=CELL_SIZE_M), 4) for paths in sets],
+        "shares": [round(visited_share(paths, config.world.workspace), 4) for paths in sets],
         "paths_mm": kept.reshape(NUM_SKILLS, -1).tolist(),
     }
 

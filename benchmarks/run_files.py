@@ -20,8 +20,6 @@ FORMAT_VERSION = 1
 MAX_POINTS = 300
 """Most points of a series."""
 COUNTERS = ("iteration", "env_steps", "time/wall_s")
-CELL_SIZE_M = 0.05
-"""Of the table's cells that coverage counts."""
 STAGES = {"beginning": 0.0, "middle": 0.5, "end": 1.0}
 """Shares of the run at which coverage is measured."""
 RANDOM = "random policy"

@@ -34,9 +34,9 @@ from safetensors import safe_open
 from benchmarks.compare_commits import full_name, worktree
 from benchmarks.measuring import ROOT, run_benchmark
 from benchmarks.processes import descendants
-from benchmarks.report.markdown import table
 from benchmarks.training_process import Records, environment, scratch
 from service.base.errors import TandemError
+from service.base.markdown import table
 
 WORKTREE = "worktree"
 NOT_LEARNED = frozenset({"config", "format_version", "records", "run", "sha256", "wall_s"})

@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.measuring import run_benchmark
-from benchmarks.report.markdown import commit, millions, percent, table
+from benchmarks.report.markdown import commit, millions, percent
 from benchmarks.training_process import ENDLESS, PLAIN, Measured, measure_copy, overrides, scratch
+from service.base.markdown import table
 from service.config.self_play import SelfPlayConfig
 from service.store.run_directory import RunDirectory
 

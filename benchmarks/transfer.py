@@ -16,9 +16,10 @@ from typing import Any, Literal
 import numpy as np
 
 from benchmarks.measuring import run_benchmark
-from benchmarks.report.markdown import measured_on, percent, table
+from benchmarks.report.markdown import measured_on, percent
 from service.actors.evaluation import evaluate, wilson_interval
 from service.base.errors import RobotError
+from service.base.markdown import table
 from service.base.types import BoolArray, StateArray
 from service.envs.sampling import draw_first, draw_goals
 from service.registry.loading import Trained, load

@@ -22,7 +22,7 @@ from pydantic_core import PydanticUndefined
 
 import tandem_skills
 from benchmarks.measuring import ROOT
-from benchmarks.report.markdown import cell, table
+from service.base.markdown import table
 from service.cli.main import app
 from service.config import Config, load_config
 from service.config.find import METHODS, find_class
@@ -54,7 +54,7 @@ def commands() -> str:
         if not hasattr(command, "commands"):
             parts.append(f"```text\n{usage}\n```")
         rows = [record for each in command.get_params(context) if (record := each.get_help_record(context))]
-        parts.append(table(("option", "meaning"), [(f"`{cell(option)}`", prose(text)) for option, text in rows]))
+        parts.append(table(("option", "meaning"), [(f"`{option}`", prose(text)) for option, text in rows]))
     return "\n\n".join(parts) + "\n"
 
 
@@ -262,7 +262,7 @@ def first_line(thing: object) -> str:
 def prose(text: str) -> str:
     """Text of a docstring or an option as one line of Markdown."""
     text = re.sub(r":class:`~?([^`]*)`", r"`\1`", text).replace("``", "`")
-    return cell(re.sub(r"(?<!`)<(\w+)>", r"`<\1>`", " ".join(text.split())))
+    return re.sub(r"(?<!`)<(\w+)>", r"`<\1>`", " ".join(text.split()))
 
 
 if __name__ == "__main__":

@@ -22,10 +22,10 @@ from typing import Any
 
 from benchmarks.measuring import RECIPE_FILE, run_benchmark
 from benchmarks.processes import descendants
-from benchmarks.report.markdown import table
 from benchmarks.training_process import ENDLESS, Training, overrides, scratch
 from service.base.errors import TandemError
 from service.base.jsonl import read_jsonl
+from service.base.markdown import table
 from service.store.models import RunStatus
 from tests.store.redis_server import RedisServer
 from tools.rollout_audit import audit_run

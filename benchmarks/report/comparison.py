@@ -8,10 +8,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from benchmarks.report.downstream import BEST, PAPER, Seeds, each_seed, mean_until, methods_table
-from benchmarks.report.markdown import Row, millions, percent, table
+from benchmarks.report.markdown import Row, millions, percent
 from benchmarks.report.results import TRIAL, Result, by_method_and_task
 from benchmarks.reproduce import MANY_UPDATES, PAPER_PRIMITIVES, Experiment
 from service.actors.evaluation import wilson_interval
+from service.base.markdown import table
 from service.config.task_methods import TASK_METHODS
 from service.envs.tasks import PAPERS, find_task
 from service.methods.task_evaluation import Rate, rate_of

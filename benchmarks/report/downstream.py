@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from benchmarks.report.markdown import Row, table
+from benchmarks.report.markdown import Row
 from benchmarks.report.results import TRIAL, Result, by_method_and_task
 from benchmarks.run_files import steps_until
 from service.base.errors import TandemError
 from service.base.files import write_atomic
+from service.base.markdown import table
 from service.base.version import LEARNING_VERSION
 from service.config.task_methods import TASK_METHODS
 from service.envs.tasks import PAPERS, TASKS, find_task

@@ -15,7 +15,6 @@ import numpy as np
 from benchmarks.record_run import ASKED, BIN_M, NUM_BINS, NUM_SLICES
 from benchmarks.report.skills import METHODS, by_method
 from benchmarks.run_files import (
-    CELL_SIZE_M,
     RANDOM,
     STAGES,
     Records,
@@ -29,6 +28,7 @@ from service.base.files import write_atomic
 from service.base.jsonl import JsonlWriter
 from service.base.types import StateArray
 from service.config import WorkspaceConfig
+from service.config.run import CELL_SIZE_M
 from service.media.figures import (
     BLUE,
     FAINT,

@@ -1,23 +1,13 @@
-"""Words and tables that all pages share."""
+"""Words that all pages share."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 Row = Sequence[str]
-
-
-def table(head: Row, rows: Iterable[Row]) -> str:
-    """A table in Markdown."""
-    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ("---",) * len(head), *rows))
-
-
-def cell(text: str) -> str:
-    """Text as it may stand in a table."""
-    return text.replace("|", r"\|").replace("\n", " ")
 
 
 def percent(share: float, digits: int = 0) -> str:

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from statistics import median
 from typing import Any
 
-from benchmarks.report.markdown import cell, measured_on, percent, table
+from benchmarks.report.markdown import measured_on, percent
+from service.base.markdown import table
 
 Result = Mapping[str, Any]
 
@@ -35,7 +36,7 @@ def checks_table(result: Result) -> str:
     rows = [
         (
             each["what"],
-            cell(each["seen"]),
+            each["seen"],
             f"{each['seconds']:.0f} s",
             "" if each["outcome"] == "passed" else "**failed**",
         )

@@ -7,8 +7,9 @@ from itertools import groupby
 
 import numpy as np
 
-from benchmarks.report.markdown import Row, millions, percent, table
+from benchmarks.report.markdown import Row, millions, percent
 from benchmarks.run_files import RANDOM, STAGES, Run, mean_share
+from service.base.markdown import table
 
 METHODS = {"ours": "ours", "metra": "METRA", "lsd": "LSD", "dads": "DADS", "diayn": "DIAYN"}
 """Names in tables and pictures by recorded method, in the order of rows."""

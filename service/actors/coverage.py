@@ -10,9 +10,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from service.base.progress import counted
+from service.base.progress import track
 from service.base.types import FloatArray, StateArray
 from service.config import WorkspaceConfig, WorldConfig
+from service.config.run import CELL_SIZE_M
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, each_object
 from service.policies.frozen_skills import FrozenSkills, SkillPlayer
@@ -109,14 +110,14 @@ def object_paths(
         worlds.reset(rng)
         paths[:, 0] = worlds.object_position
         observe(worlds)
-        for step in counted(range(num_steps), "playing at random", num_steps, "steps"):
+        for step in track(range(num_steps), "playing at random", num_steps, "steps"):
             worlds.step(act(worlds.positions()))
             paths[:, step + 1] = worlds.object_position
             observe(worlds)
     return each_object(paths).swapaxes(1, 2).reshape(-1, num_steps + 1, 3)
 
 
-def visited_share(trajectories: StateArray, workspace: WorkspaceConfig, *, cell_size_m: float = 0.05) -> float:
+def visited_share(trajectories: StateArray, workspace: WorkspaceConfig, *, cell_size_m: float = CELL_SIZE_M) -> float:
     """Share of the workspace's table cells (seen from above) into which any trajectory moved the object.
 
     The cell in which an object started does not count for its own trajectory.

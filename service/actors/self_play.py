@@ -40,7 +40,7 @@ class StochasticPolicy(Protocol):
         """(N, O) observations to sampled actions (N, A) and log-probabilities (N,)."""
 
 
-Observer = Callable[[StateArray], None]
+StateObserver = Callable[[StateArray], None]
 """Called with the (N, S) states at the start of a turn and after each of its steps; it must copy what it keeps."""
 
 
@@ -114,7 +114,7 @@ class SelfPlay:
         return {"start_state": self.worlds.states.copy(), "start_position": self.worlds.object_position.copy()}
 
     def play_round(
-        self, players: Players, plan: RoundPlan, snapshot: GeneratorSnapshot, *, observe: Observer | None = None
+        self, players: Players, plan: RoundPlan, snapshot: GeneratorSnapshot, *, observe: StateObserver | None = None
     ) -> Rollout:
         """Play one round in every world.
 
@@ -189,7 +189,7 @@ class SelfPlay:
         return rollout
 
     def _play_alice(
-        self, players: Players, plan: RoundPlan, observe: Observer | None
+        self, players: Players, plan: RoundPlan, observe: StateObserver | None
     ) -> tuple[Turns, BoolArray, BoolArray]:
         """Alice's turns, without the reward of her goal; (N, 2 K) finger contacts; (N,) worlds that diverged."""
         game, worlds = self.config.game, self.worlds
@@ -221,7 +221,7 @@ class SelfPlay:
         return turns, contacts, diverged
 
     def _leave_alice_out(
-        self, players: Players, plan: RoundPlan, observe: Observer | None
+        self, players: Players, plan: RoundPlan, observe: StateObserver | None
     ) -> tuple[Turns, BoolArray, BoolArray]:
         """Turns without a step, as ``_play_alice`` gives them."""
         num = self.worlds.num_worlds
@@ -231,7 +231,7 @@ class SelfPlay:
         return turns, np.zeros((num, 2), dtype=bool), no_world
 
     def _play_bob(
-        self, players: Players, plan: RoundPlan, choice: GoalChoice, observe: Observer | None
+        self, players: Players, plan: RoundPlan, choice: GoalChoice, observe: StateObserver | None
     ) -> tuple[Turns, BoolArray, BoolArray]:
         """Bob's turns; (N,) solved; (N,) worlds whose physics diverged.
 

@@ -1,8 +1,8 @@
 """Progress of what takes long: a bar on a terminal, elsewhere a plain line every ten seconds.
 
-Code that takes long says so: ``with doing("evaluating", 300, "episodes") as task: ... task.advance()``. A program shows
-it by opening a ``Display``, as ``tandem`` does. Where none is open, as in a user's own program or in another thread,
-nothing is shown.
+Code that takes long says so: ``with doing("evaluating", 300, "episodes") as activity: ... activity.advance()``. A
+program shows it by opening a ``Display``, as ``tandem`` does. Where none is open, as in a user's own program or in
+another thread, nothing is shown.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PLAIN_INTERVAL_S = 10.0
 _T = TypeVar("_T")
 
 
-class Task:
+class Activity:
     """Work that takes long.
 
     Args:
@@ -58,29 +58,31 @@ class Task:
 
 
 @contextmanager
-def doing(title: str, total: int | None = None, unit: str = "", done: int = 0, *, aloud: bool = True) -> Iterator[Task]:
-    """Show the block as a task, see ``Task``.
+def doing(
+    title: str, total: int | None = None, unit: str = "", done: int = 0, *, aloud: bool = True
+) -> Iterator[Activity]:
+    """Show the block as an activity, see ``Activity``.
 
-    Plain lines tell at once of a task without a total that is ``aloud``, as nothing of it can be counted.
+    Plain lines tell at once of an activity without a total that is ``aloud``, as nothing of it can be counted.
     """
-    task, display = Task(title, total, unit, done), _open.get()
+    activity, display = Activity(title, total, unit, done), _open.get()
     if display is not None:
-        display.begin(task)
+        display.begin(activity)
         if total is None and aloud and not display.moves:
             display.say(f"{title} ...")
     try:
-        yield task
+        yield activity
     finally:
         if display is not None:
-            display.end(task)
+            display.end(activity)
 
 
-def counted(items: Iterable[_T], title: str, total: int, unit: str) -> Iterator[_T]:
-    """The items, shown as a task while they are taken."""
-    with doing(title, total, unit) as task:
+def track(items: Iterable[_T], title: str, total: int, unit: str) -> Iterator[_T]:
+    """The items, shown as an activity while they are taken."""
+    with doing(title, total, unit) as activity:
         for item in items:
             yield item
-            task.advance()
+            activity.advance()
 
 
 def answer(text: str) -> None:
@@ -126,26 +128,28 @@ class Display:
         if not self.quiet:
             self.console.print(line, highlight=False, soft_wrap=True, markup=False)
 
-    def begin(self, task: Task) -> None:
-        """Show a task that begins."""
+    def begin(self, activity: Activity) -> None:
+        """Show an activity that begins."""
         self._bars.disable = not self.moves
         self._bars.start()
-        self._bars.add_task(task.title, total=task.total, completed=task.done, unit=task.unit, note=task.note)
-        task.bar = self._bars.tasks[-1]
-        task.display, task.told_s = self, self._get_time()
+        self._bars.add_task(
+            activity.title, total=activity.total, completed=activity.done, unit=activity.unit, note=activity.note
+        )
+        activity.bar = self._bars.tasks[-1]
+        activity.display, activity.told_s = self, self._get_time()
 
-    def advanced(self, task: Task) -> None:
-        """Show how far a task is."""
-        self._bars.update(task.bar.id, description=task.title, completed=task.done, note=task.note)
+    def advanced(self, activity: Activity) -> None:
+        """Show how far an activity is."""
+        self._bars.update(activity.bar.id, description=activity.title, completed=activity.done, note=activity.note)
         now_s = self._get_time()
-        if not self.moves and now_s - task.told_s >= PLAIN_INTERVAL_S:
-            task.told_s = now_s
-            self.say(line(task))
+        if not self.moves and now_s - activity.told_s >= PLAIN_INTERVAL_S:
+            activity.told_s = now_s
+            self.say(line(activity))
 
-    def end(self, task: Task) -> None:
-        """Show a task no more."""
-        task.display = None
-        self._bars.remove_task(task.bar.id)
+    def end(self, activity: Activity) -> None:
+        """Show an activity no more."""
+        activity.display = None
+        self._bars.remove_task(activity.bar.id)
         if not self._bars.tasks:
             self._bars.stop()
             self._bars = self._new_bars()
@@ -171,7 +175,7 @@ class Display:
 
 
 class _Bars(Progress):
-    """A row for each task, and below them the answer to a signal."""
+    """A row for each activity, and below them the answer to a signal."""
 
     answer = ""
 
@@ -186,9 +190,9 @@ class _Numbers(ProgressColumn):
         return Text("\n".join(filter(None, (_numbers(task), task.fields["note"]))))
 
 
-def line(task: Task) -> str:
-    """How far a task is that has been shown, in one line."""
-    return f"{task.title}: {' | '.join(filter(None, (_numbers(task.bar), task.note)))}"
+def line(activity: Activity) -> str:
+    """How far an activity is that has been shown, in one line."""
+    return f"{activity.title}: {' | '.join(filter(None, (_numbers(activity.bar), activity.note)))}"
 
 
 def _numbers(bar: Bar) -> str:

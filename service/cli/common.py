@@ -30,7 +30,7 @@ from service.base.errors import (
     did_you_mean,
     one_line,
 )
-from service.base.progress import Display, Task, display, doing
+from service.base.progress import Activity, Display, display, doing
 from service.base.version import __version__
 from service.envs.tasks import TASKS
 from service.runs.signals import InterruptError
@@ -168,7 +168,7 @@ def typed_options(context: typer.Context, names: Sequence[str]) -> list[str]:
     return words
 
 
-def loading() -> AbstractContextManager[Task]:
+def loading() -> AbstractContextManager[Activity]:
     """Show that packages and parameters are being loaded, which takes seconds on a busy machine."""
     return doing("loading", aloud=False)
 

@@ -43,7 +43,7 @@ def model_file(name: str, sha256: str | None = None) -> Path:
         if found is None or not found.submodule_search_locations:
             raise ConfigError(f"model {name}: no Python package {package!r} is installed here")
         path = Path(found.submodule_search_locations[0]) / rest
-    if sha256 is not None and (digest := digest_of(name)) != sha256:
+    if sha256 is not None and (digest := file_digest(name)) != sha256:
         raise ConfigError(
             f"model {name} is not the one that was described: sha256 {digest[:12]}, not {sha256[:12]}; "
             "put that file back, or begin a new run"
@@ -56,7 +56,7 @@ def absolute(name: str, directory: Path) -> str:
     return name if name.startswith(PACKAGE) else str((directory / name).resolve())
 
 
-def digest_of(name: str) -> str:
+def file_digest(name: str) -> str:
     """The sha256 of a file that a description names.
 
     Raises:
@@ -88,7 +88,7 @@ class MeshConfig(FrozenModel):
         pieces = tuple(absolute(piece, Path()) for piece in self.pieces)
         digests, lower, upper, volume = [], np.full(3, np.inf), np.full(3, -np.inf), 0.0
         for name in pieces:
-            digests.append(digest_of(name))
+            digests.append(file_digest(name))
             vertices, own_volume = _read_piece(name, self.scale)
             lower, upper = np.minimum(lower, vertices.min(axis=0)), np.maximum(upper, vertices.max(axis=0))
             volume += own_volume

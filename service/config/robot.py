@@ -9,7 +9,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from service.base.errors import ConfigError
 from service.config.frozen import FrozenModel, first_error
-from service.config.model_files import Vector, absolute, digest_of
+from service.config.model_files import Vector, absolute, file_digest
 from service.config.tree import read_yaml
 
 Quaternion = tuple[float, float, float, float]
@@ -159,4 +159,4 @@ def read_robot(path: Path) -> RobotConfig:
 def _found(name: str, directory: Path) -> dict[str, Any]:
     """The model's absolute path, or its package, and the digest of the file there."""
     name = absolute(name, directory)
-    return {"model": name, "model_sha256": digest_of(name)}
+    return {"model": name, "model_sha256": file_digest(name)}

@@ -12,6 +12,8 @@ from pydantic import Field
 from service.config.frozen import FrozenModel
 from service.config.world import WorldConfig
 
+CELL_SIZE_M = 0.05
+"""Usual edge of a goal cell."""
 SUCCESS_DISTANCE_M = 0.05
 """Greatest distance from object to goal that counts as success (paper: 5 cm)."""
 

@@ -11,7 +11,7 @@ from pydantic import Field, PositiveInt, model_validator
 
 from service.base.user_code import parse_reference
 from service.config.frozen import FrozenModel
-from service.config.run import Config
+from service.config.run import CELL_SIZE_M, Config
 
 
 class GameConfig(FrozenModel):
@@ -126,7 +126,7 @@ class GeneratorConfig(FrozenModel):
         False, description="replayed goals also start where games do, when Bob can learn from that"
     )
     replay_buffer_size: int = Field(4096, ge=1)
-    cell_size_m: float = Field(0.05, gt=0.0, description="edge of a goal cell of the difficulty grid")
+    cell_size_m: float = Field(CELL_SIZE_M, gt=0.0, description="edge of a goal cell of the difficulty grid")
     novelty_window: int = Field(50, ge=1, description="iterations without a new cell before the run may stop")
     stop_success_rate: float = Field(
         0.95, gt=0.0, le=1.0, description="of all that Bob plays in that window, the share that he has to solve"

@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from service.base.markdown import table
 from service.base.tensors import digest_of
 from service.base.types import FloatArray
 from service.base.version import __version__, git_commit
@@ -340,7 +341,7 @@ def make_readme(about: Description, start: FloatArray) -> str:
     observes_delay = any(field["name"] == DELAY for field in about["observation"])
     text = _README.format(
         **about,
-        networks_table=_table(
+        networks_table=table(
             ("file", "what it is", "inputs", "outputs"),
             ((f"`{one['file']}`", one["title"], _arrays(one["inputs"]), _arrays(one["outputs"])) for one in networks),
         ),
@@ -348,19 +349,19 @@ def make_readme(about: Description, start: FloatArray) -> str:
         extreme=max(one["max_abs_difference_extreme"] for one in networks),
         needs=_NEEDS[about["format"]],
         program=program(about, start),
-        observation_table=_table(
+        observation_table=table(
             ("first column", "name", "components", "unit", "meaning"),
             (
                 (one["first"], one["name"], ", ".join(one["components"]), one["unit"], one["meaning"])
                 for one in about["observation"]
             ),
         ),
-        action_table=_table(
+        action_table=table(
             ("number", "1 asks for", "meaning"),
             ((one["name"], f"{one['full']:g} {one['unit']}", one["meaning"]) for one in about["action"]),
         ),
         rules="\n".join(f"{place}. {rule[0].upper()}{rule[1:]}." for place, rule in enumerate(about["command"], 1)),
-        response_table=_table(
+        response_table=table(
             ("axis", "share covered in a step, in motion", "from rest"),
             (
                 (
@@ -378,7 +379,7 @@ def make_readme(about: Description, start: FloatArray) -> str:
             if one["asked_m"] > 0.0
         ),
         pressing=_pressing(about["gripper"]),
-        motion_table=_table(
+        motion_table=table(
             (f"in {measured['motion']['num_episodes']} episodes", "median", "99 %", "greatest"),
             (
                 (title, *(f"{value:.2f}" for value in measured["motion"][key].values()))
@@ -388,7 +389,7 @@ def make_readme(about: Description, start: FloatArray) -> str:
                 )
             ),
         ),
-        late_table=_table(
+        late_table=table(
             ("positions are late by", "success at the last step (95 %)"),
             (
                 (
@@ -409,7 +410,7 @@ def make_readme(about: Description, start: FloatArray) -> str:
         text += _TASK.format(about["task"])
     if about["fixtures"]:
         rows = ((one["name"], *_ranges(one)) for one in about["fixtures"])
-        text += _FIXTURES.format(_table(("fixture", "x, m", "y, m", "z, m"), rows))
+        text += _FIXTURES.format(table(("fixture", "x, m", "y, m", "z, m"), rows))
     return text
 
 
@@ -450,7 +451,3 @@ def _ranges(box: Mapping[str, Sequence[float]]) -> list[str]:
 
 def _arrays(entries: Iterable[Mapping[str, Any]]) -> str:
     return ", ".join(f"`{one['name']}` ({', '.join(['N', *map(str, one['shape'])])})" for one in entries)
-
-
-def _table(header: Sequence[object], rows: Iterable[Sequence[object]]) -> str:
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in (header, ["---"] * len(header), *rows))

@@ -8,6 +8,7 @@ import numpy as np
 
 from service.base.types import Array, BoolArray, IntArray, StateArray
 from service.config import WorldConfig
+from service.config.run import CELL_SIZE_M
 from service.config.self_play import SelfPlayConfig
 from service.envs.observations import distances, each_object
 from service.envs.state_layout import StateLayout, obstacle_columns
@@ -56,14 +57,11 @@ NUM_ARRANGEMENTS = len(ARRANGEMENT_NAMES)
 _STACKED_WITHIN_M = 0.01, 0.025
 """Up and sideways, of the place where the middle of one is exactly above the other's."""
 
-CELL_SIZE_M = 0.05
-"""Usual edge of a goal cell."""
-
 
 class GoalCells:
     """Cells that cover the workspace, as many for each object."""
 
-    def __init__(self, world: WorldConfig, cell_size_m: float) -> None:
+    def __init__(self, world: WorldConfig, cell_size_m: float = CELL_SIZE_M) -> None:
         self.bounds_m = world.workspace.lower_m, world.workspace.upper_m
         """Lower and upper corner of the workspace, metres."""
         self._lower: StateArray = np.array(self.bounds_m[0])

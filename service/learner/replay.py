@@ -18,7 +18,7 @@ _LAST_STEP = "last_step"
 _GOES_ON = np.iinfo(np.int32).max
 
 
-class Places(NamedTuple):
+class Indices(NamedTuple):
     """Transitions in a buffer."""
 
     step: NDArray[np.int64]
@@ -64,27 +64,27 @@ class ReplayBuffer:
             self._began[world] = self.num_added + 1
         self.num_added += 1
 
-    def draw(self, size: int, rng: np.random.Generator, *, newest: int | None = None) -> Places:
+    def draw(self, size: int, rng: np.random.Generator, *, newest: int | None = None) -> Indices:
         """Draw ``size`` transitions, all alike, with replacement; of the newest steps of every world, or of all."""
         kept = self.num_steps if newest is None else min(self.num_steps, newest)
         oldest = max(self._first, self.num_added - kept)
         flat = rng.integers(oldest * self.num_worlds, self.num_added * self.num_worlds, size)
-        return Places(*np.divmod(flat, self.num_worlds))
+        return Indices(*np.divmod(flat, self.num_worlds))
 
-    def draw_later(self, places: Places, rng: np.random.Generator) -> Places:
+    def draw_later(self, places: Indices, rng: np.random.Generator) -> Indices:
         """Draw for each place one of the same episode, not before it, all alike ("future", Andrychowicz et al. 2017).
 
         Of an episode that goes on, what there is so far.
         """
         last = np.minimum(self._last_step[places.step % self.num_steps, places.world], self.num_added - 1)
-        return Places(rng.integers(places.step, last + 1), places.world)
+        return Indices(rng.integers(places.step, last + 1), places.world)
 
-    def read(self, places: Places) -> Columns:
+    def read(self, places: Indices) -> Columns:
         """Copies of all columns there, (B, size) each."""
         rows = (places.step % self.num_steps, places.world)
         return {name: values[rows] for name, values in self._columns.items()}
 
-    def column(self, name: str, places: Places) -> FloatArray:
+    def column(self, name: str, places: Indices) -> FloatArray:
         """A copy of one column there, (B, size)."""
         values: FloatArray = self._columns[name][places.step % self.num_steps, places.world]
         return values

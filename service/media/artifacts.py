@@ -9,7 +9,7 @@ from pathlib import Path
 
 from service.actors.coverage import NUM_SKILLS, skill_paths, skill_trajectories
 from service.base.errors import TandemError
-from service.base.progress import counted
+from service.base.progress import track
 from service.base.types import StateArray
 from service.config.self_play import SelfPlayConfig
 from service.config.skills import SkillDiscoveryConfig
@@ -45,7 +45,7 @@ def make_artifacts(directory: RunDirectory, registry: Path | str = "registry") -
         makers["coverage"] = partial(_draw_coverage, directory, trained)
     makers["video"] = partial(_draw_video, directory, trained)
     files = {}
-    for name, make in counted(makers.items(), "drawing", len(makers), "pictures"):
+    for name, make in track(makers.items(), "drawing", len(makers), "pictures"):
         try:
             files[name] = make()
         except TandemError as error:

@@ -14,7 +14,7 @@ import numpy as np
 
 from service.base.errors import TandemError, needs_extra
 from service.base.files import os_errors
-from service.base.progress import counted
+from service.base.progress import track
 from service.base.types import FloatArray, StateArray
 from service.base.version import __version__
 from service.config import Config
@@ -130,7 +130,7 @@ def _buffers(played: Sequence[Played], config: Config) -> Iterator[object]:
     if isinstance(config, SelfPlayConfig) and played[0].is_alice:  # states of self-play may have a column more
         blocked = config.game.blocked_gripper_fraction
     with WorldBatch(config.world, longest, num_threads=1, blocked_fraction=blocked) as worlds:
-        for each in counted(played, "writing the data set", len(played), "episodes"):
+        for each in track(played, "writing the data set", len(played), "episodes"):
             yield EpisodeBuffer(**_arrays(each, worlds, config.success_distance_m))
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from service.actors.coverage import skill_paths
 from service.actors.evaluation import DeterministicPolicy, evaluate
 from service.actors.self_play import Players, SelfPlay, StochasticPolicy
-from service.base.progress import counted
+from service.base.progress import track
 from service.base.types import BoolArray, FloatArray, StateArray
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
@@ -87,7 +87,7 @@ def play_rounds(
     num_worlds = min(_NUM_WORLDS, num_rounds)
     num_batches = math.ceil(num_rounds / num_worlds)
     batches = islice(_play(config, alice, bob, num_worlds=num_worlds, seed=seed), num_batches)
-    played = counted(batches, "playing rounds", num_batches, "batches")
+    played = track(batches, "playing rounds", num_batches, "batches")
     return [each for _, recorded in played for each in recorded][:num_rounds]
 
 
@@ -105,7 +105,7 @@ def record_rounds(
     rounds: list[tuple[_Interest, RecordedRound]] = []
     played = _play(config, alice, bob, num_worlds=max(_NUM_WORLDS, num_rounds), seed=seed)
     batches = islice(played, _MAX_ROLLOUTS)
-    for records, recorded in counted(batches, "playing rounds", _MAX_ROLLOUTS, "batches at most"):
+    for records, recorded in track(batches, "playing rounds", _MAX_ROLLOUTS, "batches at most"):
         rounds += zip(_interest(records, config.world), recorded, strict=True)
         if sum(played for (played, *_), _ in rounds) >= num_rounds:
             break

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from service.base.errors import TandemError
-from service.base.progress import counted
+from service.base.progress import track
 from service.config import WorldConfig
-from service.envs.rendering.camera import DEFAULT_VIEW, View
+from service.envs.rendering.camera import DEFAULT_VIEW, CameraView
 from service.envs.rendering.renderer import Image, SceneRenderer
 from service.generator.validity import Verdict
 from service.media.encoding import encode
@@ -52,7 +52,7 @@ class FilmOptions:
     width: int = 1280
     """Of the whole film, pixels, even."""
     height: int = 720
-    view: View = DEFAULT_VIEW
+    view: CameraView = DEFAULT_VIEW
     speed: float = 1.0
     """Seconds of the world in a second of the film."""
 
@@ -78,7 +78,7 @@ def write_video(
     options = options or FilmOptions()
     stride, frame_s = _timing(config, options.speed)
     with SceneRenderer(config, options.width // 2, options.height - BAR_HEIGHT, options.view) as renderer:
-        numbered = counted(enumerate(rounds, start=1), "drawing the video", len(rounds), "rounds")
+        numbered = track(enumerate(rounds, start=1), "drawing the video", len(rounds), "rounds")
         frames = (
             frame
             for number, each in numbered
@@ -162,7 +162,7 @@ def _episode_frames(
 ) -> Iterator[Image]:
     num = episodes.states.shape[1]
     steps = _thinned(len(episodes.states), stride)
-    for step in counted(steps, "drawing the video", len(steps), "pictures"):
+    for step in track(steps, "drawing the video", len(steps), "pictures"):
         episode, rows = 0, []
         for row in panes:
             pictures = []

@@ -15,7 +15,7 @@ from service.base.types import Arrays, Metrics, StateArray
 from service.config.distillation import DistillingConfig
 from service.config.world import ObservedConfig
 from service.envs.observations import each_object, layouts
-from service.generator.bins import CELL_SIZE_M, GoalCells
+from service.generator.bins import GoalCells
 from service.generator.validity import in_workspace
 from service.learner import transfer
 from service.learner.distillation import Distiller
@@ -53,7 +53,7 @@ class Distillation(Method):
                 networks.MCPPolicy(config.policy.bob, layouts=layouts(config.world)), config.distillation
             )
         self._rng = np.random.default_rng(config.seed)
-        self._cells = GoalCells(config.world, CELL_SIZE_M)
+        self._cells = GoalCells(config.world)
         self._tries, self._solved = (np.zeros(len(self._cells), dtype=np.int64) for _ in range(2))
         self._num_broken = 0
         self._teacher: Arrays = {}

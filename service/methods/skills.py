@@ -19,7 +19,7 @@ from service.base.types import Metrics
 from service.base.user_code import CodeError, checked, naming_errors_of, recorded
 from service.config import parse_config
 from service.config.skills import SKILLS_OF, SkillDiscoveryConfig, SkillsConfig
-from service.generator.bins import CELL_SIZE_M, GoalCells, in_air
+from service.generator.bins import GoalCells, in_air
 from service.generator.validity import in_workspace
 from service.methods.intrinsic_reward import IntrinsicReward
 from service.methods.method import Iteration, Method, State, goal_grid
@@ -44,7 +44,7 @@ class SkillDiscovery(Method):
         super().__init__()
         self._config, self._skills = config, config.skills
         self._loop, self._worlds, self._batches = make_skill_loop(config)
-        self._cells = GoalCells(config.world, CELL_SIZE_M)
+        self._cells = GoalCells(config.world)
         self._visits = np.zeros(len(self._cells), dtype=np.int64)  # ends of episodes that moved the object
 
     def step(self) -> Iteration:

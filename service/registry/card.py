@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from math import prod
 from typing import Any
 
 import yaml
 
+from service.base.markdown import table
 from service.config.skills import SKILLS_OF
 from service.config.task_methods import TASK_METHODS
 from service.registry.manifest import Manifest
@@ -107,15 +108,15 @@ def model_card(manifest: Manifest, *, licence: str = LICENCE) -> str:
         f"---\n{yaml.safe_dump(head, sort_keys=False, allow_unicode=True)}---",
         f"# {manifest.reference}",
         what,
-        _table(("", ""), facts.items()),
+        table(("", ""), facts.items()),
         "## How it was trained",
-        _table(("", ""), training.items()),
+        table(("", ""), ((name, value) for name, value in training.items() if value is not None)),
         *([_HISTORY, _yaml(manifest.history)] if manifest.history else []),
         "The whole configuration:",
         _yaml(config),
         "## Results",
-        *([_OWN if "own_task" in spaces else _SUCCESS, _table(("goals", *_WHEN.values()), success)] if success else []),
-        *([_table(("metric", "value"), others)] if others else []),
+        *([_OWN if "own_task" in spaces else _SUCCESS, table(("goals", *_WHEN.values()), success)] if success else []),
+        *([table(("metric", "value"), others)] if others else []),
         *(["The version has none."] if not success and not others else []),
         "## How to load it",
         "No index of packages has Tandem yet. In a clone of its repository:",
@@ -206,12 +207,6 @@ def _at(tree: Any, *keys: str) -> Any:
     for key in keys:
         tree = tree.get(key) if isinstance(tree, Mapping) else None
     return tree
-
-
-def _table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A table of the rows whose values are all known."""
-    cells = [[str(cell).replace("|", "\\|").replace("\n", " ") for cell in row] for row in rows if None not in row]
-    return "\n".join(f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header), *cells))
 
 
 def _yaml(tree: Any) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from math import inf
 
-from service.base.progress import Display, Task, line
+from service.base.progress import Activity, Display, line
 
 _PATTERNS = {
     "alice/valid_fraction": "{:.0%}",
@@ -35,13 +35,13 @@ class Progress:
 
     def __init__(self, display: Display) -> None:
         self._display = display
-        self._runs: dict[str, tuple[Task, dict[str, float]]] = {}
+        self._runs: dict[str, tuple[Activity, dict[str, float]]] = {}
         """Bars and rates by title."""
 
     def close(self) -> None:
         """End the bars."""
-        for task, _ in self._runs.values():
-            self._end(task)
+        for activity, _ in self._runs.values():
+            self._end(activity)
 
     def say(self, text: str) -> None:
         """Print a plain line."""
@@ -54,23 +54,23 @@ class Progress:
         """
         env_steps = int(metrics["env_steps"] or 0)
         if title not in self._runs:
-            self._runs[title] = Task(title, total, "env steps"), {}
+            self._runs[title] = Activity(title, total, "env steps"), {}
             self._display.begin(self._runs[title][0])
-        task, rates = self._runs[title]
+        activity, rates = self._runs[title]
         for key in _PATTERNS:
             new = metrics.get(key)
             if new is not None:
                 old = new if key.startswith("evaluation/") else rates.get(key, new)
                 rates[key] = _SMOOTHING * old + (1 - _SMOOTHING) * new
         shown = [key for key in _PATTERNS if key in rates]
-        task.note = " | ".join(f"{key.split('/')[1]} {_PATTERNS[key].format(rates[key])}" for key in shown)
+        activity.note = " | ".join(f"{key.split('/')[1]} {_PATTERNS[key].format(rates[key])}" for key in shown)
         if env_steps >= total:
-            task.told_s = inf  # its last line follows anyway
-        task.advance(env_steps - task.done)
+            activity.told_s = inf  # its last line follows anyway
+        activity.advance(env_steps - activity.done)
         if env_steps >= total:
-            self._end(task)
+            self._end(activity)
 
-    def _end(self, task: Task) -> None:
-        if task.display is not None:
-            self._display.end(task)
-            self.say(line(task))
+    def _end(self, activity: Activity) -> None:
+        if activity.display is not None:
+            self._display.end(activity)
+            self.say(line(activity))

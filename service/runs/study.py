@@ -27,7 +27,7 @@ from service.base.errors import ConfigError, StorageError, StoreError, TandemErr
 from service.base.files import os_errors, read_regular, write_atomic
 from service.base.lock import DirectoryLock
 from service.base.parsing import ParseError, parse_json
-from service.base.progress import answer, counted
+from service.base.progress import answer, track
 from service.config import Config, dump_config
 from service.config.frozen import FrozenModel
 from service.config.self_play import SelfPlayConfig
@@ -234,7 +234,7 @@ class Study:
         missing = [name for name in chosen if SELECTED not in runs[name].result]
         if missing:
             progress.say(f"learning is over; runs to evaluate: {len(missing)}")
-        for name in counted(missing, "evaluating the runs", len(missing), "runs"):
+        for name in track(missing, "evaluating the runs", len(missing), "runs"):
             try:
                 result = runs[name].result | select(self.path / name)
                 self._note(name, runs[name].model_copy(update={"result": result}))

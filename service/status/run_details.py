@@ -12,6 +12,7 @@ import numpy as np
 from service.base.errors import ConfigError, StorageError
 from service.base.files import last_lines, open_regular
 from service.base.parsing import ParseError, parse_json
+from service.config.run import CELL_SIZE_M
 from service.config.tree import read_yaml
 from service.generator.records import of_furthest
 from service.status.schemas import GoalFrame, GoalFrames, RunCommand, RunLog, RunSetup
@@ -20,7 +21,6 @@ from service.store.models import ACTIVE, OUTPUT_FILE, GoalGrid, RunStatus
 from service.store.run_history import read_history
 from service.store.run_log import LogLine, read_log
 
-DEFAULT_CELL_M = 0.05
 FRAME_BYTES = 256 * 1024
 """Of the records of goals that are read for one frame, some thousand goals."""
 
@@ -90,7 +90,7 @@ def log(directory: Path | None, limit: int) -> RunLog:
 
 def goal_frames(directory: Path | None, grid: GoalGrid | None, num_frames: int) -> GoalFrames:
     """Read how goals changed: of each of equal parts of the record, how often Bob reached those of a cell."""
-    cell_m = grid.cell_size_m if grid is not None else DEFAULT_CELL_M
+    cell_m = grid.cell_size_m if grid is not None else CELL_SIZE_M
     lower = np.array(grid.lower_m if grid is not None else (0.0, 0.0, 0.0))
     frames = []
     if directory is not None:

@@ -8,7 +8,7 @@ import time
 import pytest
 from rich.console import Console
 
-from service.base.progress import PLAIN_INTERVAL_S, Display, answer, counted, doing
+from service.base.progress import PLAIN_INTERVAL_S, Display, answer, doing, track
 from service.cli.common import Terminal
 from tests.clock import Clock
 
@@ -78,7 +78,7 @@ def test_what_nobody_can_count_is_said_at_once():
             assert lines(shown) == []
         with doing("starting Ray"):
             assert lines(shown) == ["starting Ray ..."]
-        assert list(counted("abc", "letters", 3, "letters")) == ["a", "b", "c"]
+        assert list(track("abc", "letters", 3, "letters")) == ["a", "b", "c"]
         assert len(lines(shown)) == 1
 
 
@@ -87,7 +87,7 @@ def test_without_a_display_and_in_other_threads_nothing_is_shown():
         task.advance()
     answer("unheard")
     with Display(console()) as shown:
-        thread = threading.Thread(target=lambda: list(counted(range(3), "x", 3, "x")) or doing("y").__enter__())
+        thread = threading.Thread(target=lambda: list(track(range(3), "x", 3, "x")) or doing("y").__enter__())
         thread.start()
         thread.join()
         assert lines(shown) == []

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from service.learner.replay import Places, ReplayBuffer
+from service.learner.replay import Indices, ReplayBuffer
 
 NUM_STEPS, NUM_WORLDS = 7, 2
 
@@ -44,7 +44,7 @@ def test_it_draws_all_alike():
 )
 def test_later_places_are_of_the_same_episode(num_added, end, step, world, later):
     replay = filled(num_added, ends={(end, 0)})
-    places = Places(np.full(300, step), np.full(300, world))
+    places = Indices(np.full(300, step), np.full(300, world))
     found = replay.draw_later(places, np.random.default_rng(0))
     assert set(found.step.tolist()) == later
     assert set(found.world.tolist()) == {world}
@@ -72,11 +72,11 @@ def test_a_buffer_of_another_size_takes_the_newest_steps(num_steps, kept):
     first, second = filled(10, ends={(8, 0)}), ReplayBuffer(num_steps, NUM_WORLDS, {"at": 2})
     second.load_state(first.state())
     step, world = (each.ravel() for each in np.meshgrid(list(kept), range(NUM_WORLDS)))
-    places = Places(step, world)
+    places = Indices(step, world)
     np.testing.assert_array_equal(second.read(places)["at"], np.stack(places, axis=1))
     again = ReplayBuffer(20, NUM_WORLDS, {"at": 2})
     again.load_state(second.state())  # it was stopped, and goes on once more
     for replay in (second, again):  # nothing is drawn that it never had
         assert set(replay.draw(500, np.random.default_rng(0)).step.tolist()) == set(kept)
-    later = second.draw_later(Places(np.full(99, 7), np.zeros(99, dtype=int)), np.random.default_rng(0))
+    later = second.draw_later(Indices(np.full(99, 7), np.zeros(99, dtype=int)), np.random.default_rng(0))
     assert set(later.step.tolist()) == {7, 8}

@@ -14,7 +14,7 @@ _HOW = "write a view, such as close, or numbers, such as azimuth=120,elevation=-
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class CameraView:
     """Direction and distance from which a camera looks at a point."""
 
     azimuth_deg: float
@@ -44,12 +44,12 @@ class View:
 
 _WORKSPACE_M = (0.0, 0.0, 0.12)
 VIEWS = {
-    "front": View(146.0, -21.0, 1.68, (-0.15, 0.0, 0.19)),
-    "far": View(146.0, -21.0, 2.6, (-0.25, 0.0, 0.1)),
-    "close": View(146.0, -26.0, 1.0, _WORKSPACE_M),
-    "side": View(90.0, -14.0, 1.5),
-    "behind": View(20.0, -34.0, 1.5, _WORKSPACE_M),
-    "top": View(180.0, -89.0, 1.2, (0.0, 0.0, 0.0)),
+    "front": CameraView(146.0, -21.0, 1.68, (-0.15, 0.0, 0.19)),
+    "far": CameraView(146.0, -21.0, 2.6, (-0.25, 0.0, 0.1)),
+    "close": CameraView(146.0, -26.0, 1.0, _WORKSPACE_M),
+    "side": CameraView(90.0, -14.0, 1.5),
+    "behind": CameraView(20.0, -34.0, 1.5, _WORKSPACE_M),
+    "top": CameraView(180.0, -89.0, 1.2, (0.0, 0.0, 0.0)),
 }
 """Views by the names that commands take."""
 DEFAULT_VIEW = VIEWS["front"]
@@ -61,7 +61,7 @@ _NUMBERS = {
 """Fields and ranges of the numbers that may be given."""
 
 
-def parse_view(text: str) -> View:
+def parse_view(text: str) -> CameraView:
     """The view that ``close``, ``azimuth=120,distance=2`` or ``side,elevation=-30`` means.
 
     Raises:

@@ -19,7 +19,7 @@ from service.config import WorldConfig
 from service.config.objects import Color
 from service.envs.objects import geometry
 from service.envs.observations import each_object
-from service.envs.rendering.camera import DEFAULT_VIEW, View
+from service.envs.rendering.camera import DEFAULT_VIEW, CameraView
 from service.envs.rendering.decoration import decorate
 from service.envs.rendering.gl import RenderError, open_drawing
 from service.envs.scene import build_layout, build_spec
@@ -50,7 +50,9 @@ class SceneRenderer:
         RenderError: this machine has no OpenGL that works without a window.
     """
 
-    def __init__(self, config: WorldConfig, width: int = 640, height: int = 480, view: View = DEFAULT_VIEW) -> None:
+    def __init__(
+        self, config: WorldConfig, width: int = 640, height: int = 480, view: CameraView = DEFAULT_VIEW
+    ) -> None:
         self.camera = view.camera()
         """Place the pictures are taken from; it may be moved at any time."""
         self.model = _build_model(config, width, height)
