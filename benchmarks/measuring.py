@@ -28,7 +28,6 @@ from service.base.errors import TandemError
 from service.base.files import write_atomic
 from service.base.markdown import table
 from service.base.version import git_commit
-from service.registry.loading import Trained, load
 
 ROOT = Path(__file__).parents[1]
 RECIPE_FILE = ROOT / "configs" / "pretrain" / "panda_cube.yaml"
@@ -215,17 +214,6 @@ def run_benchmark(
         write_json(file, result)
     print(report(result))
     return int(failed(result))
-
-
-def of_each(
-    primitives: Sequence[str], registry: str, measure: Callable[[Trained], dict[str, Any]]
-) -> dict[str, dict[str, Any]]:
-    """What ``measure`` says of each of the primitives, with their names and digests, by reference."""
-    loaded = {reference: load(reference, registry) for reference in primitives}
-    return {
-        reference: {"name": trained.name, "digest": trained.digest, **measure(trained)}
-        for reference, trained in loaded.items()
-    }
 
 
 def _cpu_model() -> str:

@@ -243,7 +243,7 @@ def _alike(world: WorldConfig) -> list[int]:
 
 PAPER = Layouts()
 """Layouts of the paper, which worlds have unless their configuration says otherwise."""
-FULL, BOB, BOB_VALUE, SPACES = PAPER.full, PAPER.bob, PAPER.bob_value, PAPER.spaces
+BOB, SPACES = PAPER.bob, PAPER.spaces
 
 
 def each_object(rows: NDArray[Any]) -> NDArray[Any]:

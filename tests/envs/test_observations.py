@@ -66,13 +66,13 @@ def test_positions(worlds):
 
 def test_full(worlds):
     expected = np.hstack([positions(worlds), privileged(worlds), np.full((2, 1), 0.25)])
-    assert_layout(worlds.full(0.25), expected, observations.FULL.size)
+    assert_layout(worlds.full(0.25), expected, observations.PAPER.full.size)
 
 
 def test_bob_value(worlds):
     relative = GOALS - [[0.2, -0.1, 0.3], [-0.15, 0.12, 0.025]]
     expected = np.hstack([positions(worlds), privileged(worlds), GOALS, relative])
-    assert_layout(worlds.bob_value(GOALS), expected, observations.BOB_VALUE.size)
+    assert_layout(worlds.bob_value(GOALS), expected, observations.PAPER.bob_value.size)
 
 
 def test_bobs_input_is_put_together(worlds):
@@ -93,10 +93,10 @@ def test_normalisation_by_hand():
     scale = [0.12, 0.12, 0.12, 0.02, 0.02, 0.12, 0.12, 0.12, 0.1, 0.1, 0.1]
     motion_scale = [0.5, 0.5, 0.5, 0.2, 0.2, 0.5, 0.5, 0.5, 0.5, 0.5]
     goal_and_way = [0, 0, 0.15, 0, 0, 0], [0.12, 0.12, 0.12, 0.1, 0.1, 0.1]
-    value = observations.BOB_VALUE.normalisation
+    value = observations.PAPER.bob_value.normalisation
     np.testing.assert_array_equal(value.offset, np.float32([*offset, *[0] * 8, 0.5, 0.5, *goal_and_way[0]]))
     np.testing.assert_array_equal(value.scale, np.float32([*scale, *motion_scale, *goal_and_way[1]]))
-    full = observations.FULL.normalisation
+    full = observations.PAPER.full.normalisation
     np.testing.assert_array_equal(full.offset, np.float32([*offset, *[0] * 8, 0.5, 0.5, 0.5]))
     np.testing.assert_array_equal(full.scale, np.float32([*scale, *motion_scale, 0.5]))
 
@@ -106,9 +106,13 @@ def test_normalisation_by_hand():
     [
         (observations.ACTION.mirror, ACTION, [1, -2, 3, 4]),
         (observations.BOB.mirror, [*POSITIONS, 12, 13, 14], [*MIRRORED_POSITIONS, 12, -13, 14]),
-        (observations.FULL.mirror, [*POSITIONS, *PRIVILEGED, 22], [*MIRRORED_POSITIONS, *MIRRORED_PRIVILEGED, 22]),
         (
-            observations.BOB_VALUE.mirror,
+            observations.PAPER.full.mirror,
+            [*POSITIONS, *PRIVILEGED, 22],
+            [*MIRRORED_POSITIONS, *MIRRORED_PRIVILEGED, 22],
+        ),
+        (
+            observations.PAPER.bob_value.mirror,
             [*POSITIONS, *PRIVILEGED, 22, 23, 24, 25, 26, 27],
             [*MIRRORED_POSITIONS, *MIRRORED_PRIVILEGED, 22, -23, 24, 25, -26, 27],
         ),

@@ -6,7 +6,7 @@ import pytest
 
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.observations import ACTION, FULL
+from service.envs.observations import ACTION, PAPER
 from service.envs.panda import PANDA
 from service.envs.sampling import sample_in_volume
 from service.envs.scene import build_model
@@ -228,12 +228,12 @@ def test_the_task_has_no_left_and_right():
             model.opt.noslip_iterations = 0
         worlds.reset(rng)
         reflected.restore(mirror_state(worlds.states))
-        np.testing.assert_allclose(reflected.full(0.5), FULL.mirror(worlds.full(0.5)), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(reflected.full(0.5), PAPER.full.mirror(worlds.full(0.5)), rtol=0, atol=1e-12)
         for tolerance in (1e-7, 1e-5, 1e-5, 1e-5):  # contacts magnify the last bits, so not for longer
             actions = rng.uniform(-1.0, 1.0, (30, 4)).astype(np.float32)
             worlds.step(actions)
             reflected.step(ACTION.mirror(actions))
-            difference = np.abs(FULL.mirror(worlds.full(0.5)) - reflected.full(0.5))
+            difference = np.abs(PAPER.full.mirror(worlds.full(0.5)) - reflected.full(0.5))
             assert difference[:, :11].max() < tolerance
 
 

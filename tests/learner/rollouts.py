@@ -11,7 +11,7 @@ import torch
 
 from service.actors.rollout import Demonstrations, Rollout, Turns
 from service.config import Config, parse_config
-from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL
+from service.envs.observations import ACTION, BOB, PAPER
 from service.learner.learner import Learner
 from service.learner.player import Player
 from tests.generator.outcomes import make_records
@@ -60,8 +60,8 @@ def make_turns(rng: np.random.Generator, observation_size: int, value_size: int,
 def make_rollout(learner: Learner, sequence: int, *, seed: int = 0, num_demonstrations: int = 12) -> Rollout:
     """A rollout whose actions the learner's present policies could have drawn."""
     rng = np.random.default_rng([seed, sequence])
-    alice = make_turns(rng, FULL.size, FULL.size)
-    bob = make_turns(rng, BOB.size, BOB_VALUE.size)
+    alice = make_turns(rng, PAPER.full.size, PAPER.full.size)
+    bob = make_turns(rng, BOB.size, PAPER.bob_value.size)
     return Rollout(
         actor=0,
         incarnation=0,

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from service.config.self_play import ABCConfig, PPOConfig
-from service.envs.observations import ACTION, BOB, BOB_VALUE, PAPER
+from service.envs.observations import ACTION, BOB, PAPER
 from service.learner.player import Player
 from service.learner.ppo import advantages, collect
 from service.learner.samples import (
@@ -22,7 +22,7 @@ CONFIG = PPOConfig()
 
 
 def make_bob_turns(seed=0, **overrides):
-    return make_turns(np.random.default_rng(seed), BOB.size, BOB_VALUE.size, **overrides)
+    return make_turns(np.random.default_rng(seed), BOB.size, PAPER.bob_value.size, **overrides)
 
 
 class Estimate(nn.Module):
@@ -100,7 +100,7 @@ def test_half_of_the_samples_are_reflected_at_random():
     assert 0.3 < chosen.mean() < 0.7
     for before, after in zip(samples.columns(), mixed.columns(), strict=True):
         assert torch.equal(after[~chosen], before[~chosen])
-    mirrors = {"observation": BOB.mirror, "value_observation": BOB_VALUE.mirror, "action": ACTION.mirror}
+    mirrors = {"observation": BOB.mirror, "value_observation": PAPER.bob_value.mirror, "action": ACTION.mirror}
     for name, each in mirrors.items():
         np.testing.assert_array_equal(getattr(mixed, name)[chosen], each(getattr(samples, name)[chosen].numpy()))
     for name in ("advantage", "value_target", "value", "behaviour_log_prob"):

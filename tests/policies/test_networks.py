@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from service.config.self_play import MCPConfig, PolicyConfig
-from service.envs.observations import ACTION, BOB, BOB_VALUE, FULL, POSITIONS
+from service.envs.observations import ACTION, BOB, PAPER, POSITIONS
 from service.policies.gaussian import log_prob
 from service.policies.networks import (
     GaussianPolicy,
@@ -33,15 +33,18 @@ def seeded() -> None:
 
 
 def test_shapes(alice: GaussianPolicy, bob: MCPPolicy, config: PolicyConfig) -> None:
-    for policy, size in ((alice, FULL.size), (bob, BOB.size)):
+    for policy, size in ((alice, PAPER.full.size), (bob, BOB.size)):
         for batch in ((), (5,), (2, 5)):
             mean, std = policy(torch.zeros(*batch, size))
             assert mean.shape == std.shape == (*batch, ACTION.size)
             assert mean.dtype == torch.float32
     means, variances = bob.primitives(torch.zeros(2, 5, POSITIONS.size))
     assert means.shape == variances.shape == (2, 5, config.bob.num_primitives, ACTION.size)
-    assert ValueNetwork(FULL.normalisation, config.value)(torch.zeros(2, 5, FULL.size)).shape == (2, 5)
-    assert ValueNetwork(BOB_VALUE.normalisation, config.value)(torch.zeros(2, 5, BOB_VALUE.size)).shape == (2, 5)
+    assert ValueNetwork(PAPER.full.normalisation, config.value)(torch.zeros(2, 5, PAPER.full.size)).shape == (2, 5)
+    assert ValueNetwork(PAPER.bob_value.normalisation, config.value)(torch.zeros(2, 5, PAPER.bob_value.size)).shape == (
+        2,
+        5,
+    )
 
 
 def test_goal_reaches_only_the_gate(bob: MCPPolicy, observe: Observe) -> None:
@@ -91,7 +94,7 @@ def test_every_primitive_is_the_network_written_out(bob: MCPPolicy, config: Poli
 def test_outputs_are_bounded_for_any_input(
     alice: GaussianPolicy, bob: MCPPolicy, config: PolicyConfig, magnitude: float
 ) -> None:
-    signs = torch.tensor(np.random.default_rng(0).choice([-1.0, 1.0], (64, FULL.size)), dtype=torch.float32)
+    signs = torch.tensor(np.random.default_rng(0).choice([-1.0, 1.0], (64, PAPER.full.size)), dtype=torch.float32)
     mean, std = alice(magnitude * signs)
     assert (mean.abs() <= 2.0).all()
     assert (std.log() >= config.alice_log_std_min - ULP).all()
@@ -128,7 +131,7 @@ def test_initial_players_explore_with_the_stated_std(num_primitives: int) -> Non
     rng = np.random.default_rng(0)
     full, bob_rows = (
         torch.tensor(layout.offset + layout.scale * rng.standard_normal((500, len(layout.offset))), dtype=torch.float32)
-        for layout in (FULL.normalisation, BOB.normalisation)
+        for layout in (PAPER.full.normalisation, BOB.normalisation)
     )
     mean, std = make_alice(config)(full)
     assert mean.abs().max() < 0.1
@@ -155,13 +158,13 @@ def test_initial_primitives_and_weights_differ() -> None:
 
 @pytest.mark.usefixtures("seeded")
 def test_initial_values_are_near_zero() -> None:
-    for layout in (FULL, BOB_VALUE):
+    for layout in (PAPER.full, PAPER.bob_value):
         value = ValueNetwork(layout.normalisation, PolicyConfig().value)
         assert value(torch.randn(100, layout.size)).abs().max() < 0.1
 
 
 def test_log_prob_has_a_gradient_for_every_parameter(alice: GaussianPolicy, bob: MCPPolicy, observe: Observe) -> None:
-    for policy, size in ((alice, FULL.size), (bob, BOB.size)):
+    for policy, size in ((alice, PAPER.full.size), (bob, BOB.size)):
         mean, std = policy(torch.tensor(observe(50, size)))
         log_prob(mean.detach() + 0.5, mean, std).mean().backward()
         for name, parameter in policy.named_parameters():

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from service.config.self_play import PolicyConfig
-from service.envs.observations import BOB, FULL, POSITIONS
+from service.envs.observations import BOB, PAPER, POSITIONS
 from service.policies import forward, gaussian
 from service.policies.networks import GaussianPolicy, MCPPolicy, export_parameters, make_alice, make_bob
 from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy
@@ -26,7 +26,7 @@ Players = list[tuple[NumpyGaussianPolicy | NumpyMCPPolicy, GaussianPolicy | MCPP
 def players(alice: GaussianPolicy, bob: MCPPolicy) -> Players:
     """NumPy policy, network and observation size of both players."""
     return [
-        (NumpyGaussianPolicy(export_parameters(alice)), alice, FULL.size),
+        (NumpyGaussianPolicy(export_parameters(alice)), alice, PAPER.full.size),
         (NumpyMCPPolicy(export_parameters(bob)), bob, BOB.size),
     ]
 

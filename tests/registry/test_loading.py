@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from service.base.errors import TandemError
-from service.envs.observations import BOB, FULL
+from service.envs.observations import BOB, PAPER
 from service.export.exporting import export
 from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy
 from service.registry.bundled import BUNDLED
@@ -120,7 +120,7 @@ def test_a_name_the_registry_does_not_have_is_that_of_the_package(registry):
 def test_a_run_has_both_players_and_what_another_run_begins_from(run):
     path, learner = run
     found, weights = load(str(path)), learner.weights()
-    rows = observations(FULL.size)
+    rows = observations(PAPER.full.size)
     expected = NumpyGaussianPolicy(weights.alice).act_deterministic(rows)
     assert np.array_equal(found.alice.act_deterministic(rows), expected)
     assert found.parameters.keys() == weights.bob.keys()
