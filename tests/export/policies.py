@@ -46,7 +46,7 @@ def actor_of(method, seen=SEEN):
     composed = BOB.num_primitives if TASK_METHODS[method].composes else 4
     with torch.random.fork_rng():
         torch.manual_seed(4)
-        actor = GaussianActor(num_inputs(seen)[1], composed + (4 if TASK_METHODS[method].residual else 0), (16, 12))
+        actor = GaussianActor(num_inputs(seen)[1], composed + (4 if TASK_METHODS[method].adds_action else 0), (16, 12))
         return scattered(actor)
 
 
