@@ -139,7 +139,7 @@ def test_a_file_with_something_else_in_it(home, place):
     for name, content in NO_CONTENT.items():
         path.write_bytes(content)
         said = refuse(arguments)
-        assert path.name in said or "tiny" in said, (name, said)
+        assert path.name in said or (file.startswith("registry") and "tiny" in said), (name, said)
     with path.open("wb") as huge:
         huge.truncate(1 << 36)  # without a block on the disk
     assert path.name in refuse(arguments)

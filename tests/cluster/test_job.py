@@ -21,7 +21,9 @@ from ray.job_submission import JobSubmissionClient
 from service.registry.publishing import publish
 from service.registry.registry import Registry
 from service.runs.study import Study
+from service.status.server import StatusServer
 from service.store.checkpoints import CheckpointStore
+from service.store.disk_reader import DiskReader
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import ROOT, TINY_TASK, newest, play, read_lines, tiny_config, write_yaml
 
@@ -65,7 +67,8 @@ def head():
     gcs, dashboard, client, agent = free_ports(4)
     ports = [f"--port={gcs}", f"--dashboard-port={dashboard}", f"--ray-client-server-port={client}"]
     ports.append(f"--dashboard-agent-listen-port={agent}")
-    command = [RAY, "start", "--head", "--block", "--num-cpus=3", f"--temp-dir={scratch}", *ports]
+    without = ["--no-monitor", "--include-log-monitor=false"]  # processes that no test needs
+    command = [RAY, "start", "--head", "--block", "--num-cpus=3", f"--temp-dir={scratch}", *without, *ports]
     # Else Ray kills a job that still saves; it wants whole seconds.
     settings = {"RAY_JOB_STOP_WAIT_TIME_S": f"{PATIENCE_S:.0f}"}
     with (scratch / "head.log").open("wb") as log:
@@ -92,12 +95,8 @@ def test_a_study_of_tasks_is_killed_with_its_driver_and_stopped_and_goes_on(head
     """Two seeds, as tasks of Ray that fetch their primitives over HTTP."""
     _, address = head
     run, _ = play(tmp_path / "run", tiny_config(total_env_steps=120))
-    registry, (port,), path = Registry(tmp_path / "registry"), free_ports(1), tmp_path / "night"
+    registry, path = Registry(tmp_path / "registry"), tmp_path / "night"
     publish(registry, run.config, run.method.parameters(), {})
-    serve = [sys.executable, "-m", "service", "serve", "--runs", str(tmp_path), "--port", str(port)]
-    place = ["--runtime", "ray", "--address", address, "--status", "off", "--registry", f"http://127.0.0.1:{port}"]
-    command = [sys.executable, "-m", "service", "train", "--run-dir", str(path), *place]
-    begin = [*command, *TINY_TASK, "push", "--seeds", "0,1", "--primitives", "tiny@latest", "--parallel", "2"]
 
     def steps_saved():
         """The iterations of the newest checkpoints of the first two runs."""
@@ -123,34 +122,31 @@ def test_a_study_of_tasks_is_killed_with_its_driver_and_stopped_and_goes_on(head
         wait_for(lambda: process.poll() is not None or (goes_on() and min(steps_saved()) >= 2))
         assert process.poll() is None, process.stdout.read()
 
-    with start(*serve, "--registry", str(registry.root)) as server:
-        try:
-            wait_for(lambda: answers(f"http://127.0.0.1:{port}/v1/runs"))
-            with start(*begin, "--set", "run.total_env_steps=1_000_000") as driver:
-                try:
-                    wait_until_each_goes_on(driver, 1)
-                finally:
-                    driver.kill()
-            with start(*command, "--resume", "--parallel", "2") as driver:
-                wait_until_each_goes_on(driver, 2)  # Ray ends the tasks of the first one, and with them their processes
-                driver.send_signal(signal.SIGTERM)
-                said = driver.communicate(timeout=PATIENCE_S)[0]
-            assert driver.returncode == 128 + signal.SIGTERM, said
-            left = statuses()
-            assert [status["state"] for status in left] == ["interrupted", "interrupted"], said
-            assert [status["iteration"] for status in left] == steps_saved()  # nothing is lost
-            assert {status["study"] for status in json.loads(answers(f"http://127.0.0.1:{port}/v1/runs"))["runs"]} == {
-                None,
-                "night",
-            }
-            steps = max(status["num_env_steps"] for status in left) + 200
-            last = subprocess.run(
-                [*command, "--resume", "--set", f"run.total_env_steps={steps}"],
-                cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S,
-            )  # fmt: skip
-            assert last.returncode == 0, last.stderr
-        finally:
-            server.terminate()
+    with StatusServer(DiskReader(tmp_path), registry, port=0, runs_dir=tmp_path) as server:
+        place = ["--runtime", "ray", "--address", address, "--status", "off", "--registry", server.url]
+        command = [sys.executable, "-m", "service", "train", "--run-dir", str(path), *place]
+        begin = [*command, *TINY_TASK, "push", "--seeds", "0,1", "--primitives", "tiny@latest", "--parallel", "2"]
+        with start(*begin, "--set", "run.total_env_steps=1_000_000") as driver:
+            try:
+                wait_until_each_goes_on(driver, 1)
+            finally:
+                driver.kill()
+        with start(*command, "--resume", "--parallel", "2") as driver:
+            wait_until_each_goes_on(driver, 2)  # Ray ends the tasks of the first one, and with them their processes
+            driver.send_signal(signal.SIGTERM)
+            said = driver.communicate(timeout=PATIENCE_S)[0]
+        assert driver.returncode == 128 + signal.SIGTERM, said
+        left = statuses()
+        assert [status["state"] for status in left] == ["interrupted", "interrupted"], said
+        assert [status["iteration"] for status in left] == steps_saved()  # nothing is lost
+        listed = json.loads(answers(f"{server.url}/v1/runs"))["runs"]
+        assert {status["study"] for status in listed} == {None, "night"}
+        steps = max(status["num_env_steps"] for status in left) + 200
+        last = subprocess.run(
+            [*command, "--resume", "--set", f"run.total_env_steps={steps}"],
+            cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S,
+        )  # fmt: skip
+        assert last.returncode == 0, last.stderr
     found = Study(path).read()
     assert {(run.state, run.env_steps) for run in found.runs.values()} == {("finished", steps)}
     for name, each in found.runs.items():

@@ -8,7 +8,6 @@ import time
 from contextlib import contextmanager
 
 import psutil
-import pytest
 
 from benchmarks.processes import descendants
 from service.base.jsonl import read_jsonl
@@ -58,18 +57,12 @@ def wait_until(process, holds):
         time.sleep(0.2)
 
 
-@pytest.mark.parametrize(
-    ("number", "when"), [(signal.SIGTERM, "starting Ray"), (signal.SIGINT, "learner")], ids=lambda each: str(each)
-)
-def test_a_signal_while_it_starts(tmp_path, number, when):
+def test_a_signal_while_it_starts(tmp_path):
     with run_on_ray(tmp_path) as process:
-        wait_until(
-            process,
-            lambda: when in (tmp_path / "err").read_text() or when in descendants(process.pid).values(),
-        )
+        wait_until(process, lambda: "learner" in descendants(process.pid).values())
         below = descendants(process.pid)
-        process.send_signal(number)
-        assert process.wait(PATIENCE_S) == 128 + number
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(PATIENCE_S) == 128 + signal.SIGTERM
     assert (tmp_path / "out").read_text() == "stopped at once; nothing was saved yet\n"
     assert "Traceback" not in (tmp_path / "err").read_text()
     assert [role for pid, role in below.items() if is_alive(pid)] == []

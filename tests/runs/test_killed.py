@@ -15,7 +15,7 @@ from service.base.jsonl import JsonlWriter
 from service.runs.resuming import resumed_config
 from service.store.checkpoints import CheckpointStore
 from service.store.run_directory import RunDirectory
-from tests.runs.runs import PROCESSES, ROOT, assert_same_run, newest, play, start_endless_run, tiny_config
+from tests.runs.runs import PROCESSES, ROOT, assert_same_run, newest, play, tiny_config
 
 STEP = 4
 """The checkpoint that is killed, of those after every second iteration."""
@@ -154,18 +154,20 @@ def test_records_are_on_the_disk_before_the_checkpoint_that_knows_of_them(tmp_pa
 
 def test_real_processes_killed_at_random_moments(tmp_path):
     """The first while it runs, the second anywhere: in its imports, while it loads, or later."""
-    process, path = start_endless_run(tmp_path)
+    path = tmp_path / "run"
+    process = PROCESSES.Process(target=play, args=(path, tiny_config(total_env_steps=10**9)))
+    process.start()
     delays_s = random.uniform(0.0, 0.5), random.uniform(1.0, 4.0)
     try:
         deadline_s = time.monotonic() + 600.0
         while len(list(path.glob("checkpoints/checkpoint-*"))) < 2:
-            assert process.poll() is None, process.stderr.read()
+            assert process.is_alive()
             assert time.monotonic() < deadline_s, "no checkpoints after 600 s"
             time.sleep(0.01)
         time.sleep(delays_s[0])
     finally:
         process.kill()
-        process.communicate()
+        process.join()
     path = elsewhere(path, tmp_path / "second")
     command = [sys.executable, "-m", "service", "pretrain", "--resume", "--run-dir", str(path)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
