@@ -110,7 +110,7 @@ def test_a_prior_of_ours_is_not_chosen(file):
 def test_a_method_that_there_is_not(file):
     with pytest.raises(TandemError) as error:
         load_config(None, ["method=skills", "skills.method=metrra"])
-    assert_one_line(error.value, "skills.method 'metrra': choose one of lsd, diayn, dads, metra, csf, or FILE.py:CLASS")
+    assert_one_line(error.value, "skills.method 'metrra': choose one of lsd, dads, diayn, metra, csf, or FILE.py:CLASS")
 
 
 @pytest.mark.parametrize("word", ["way", "place"])

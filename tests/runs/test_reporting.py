@@ -321,7 +321,7 @@ def test_a_status_service_without_the_shared_disk_serves_a_run_and_stops_it(tmp_
         last = httpx.get(f"{server.url}/v1/runs/cube", headers=BEARER, **CLIENT).json()
     assert done.reason == "interrupted"
     assert (last["state"], last["epoch"], last["iteration"]) == ("interrupted", 1, done.iteration)
-    assert seen == {"runs": ["cube"], "grid": [7, 7, 7], "gauge": True}
+    assert seen == {"runs": ["cube"], "grid": [3, 3, 7], "gauge": True}
     assert list((tmp_path / "empty").iterdir()) == []
 
 
