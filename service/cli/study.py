@@ -123,7 +123,7 @@ def train_study(
                 settings = {name: each for name, (each, _, _) in planned.items()}
                 study.begin(settings, configs, start.reference if start is not None else None)
             with closing(Progress(shown())) as progress:
-                study.train(configs, place, parallel, options, signals, progress)
+                study.train(configs, place, parallel, options, signals, progress, typed)
                 if signals.first is None:
                     study.finish(configs, registry, progress)
     except InterruptError as interrupt:

@@ -267,7 +267,7 @@ def train_and_tell(
 
             done = training.train(
                 config, directory, registry,
-                resume=resume, publish=publish, on_iteration=tell, runtime=runtime, start=start,
+                resume=resume, publish=publish, on_iteration=tell, runtime=runtime, start=start, options=typed,
             )  # fmt: skip
             if done.metrics:
                 final = {name.replace("evaluation/", "final/", 1): value for name, value in done.metrics.items()}

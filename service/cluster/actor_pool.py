@@ -39,6 +39,8 @@ class ActorSlot:
     """Time from which on it is started anew."""
     num_rollouts: int = 0
     num_env_steps: int = 0
+    num_replaced: int = 0
+    """Actors that failed in this place."""
     last_error: str | None = None
     round: Round | None = None
     """The round it plays."""
@@ -116,8 +118,8 @@ class ActorSlot:
 
     def status(self) -> ActorStatus:
         """The slot's state for the status service."""
-        counted = {"num_rollouts": self.num_rollouts, "num_env_steps": self.num_env_steps}
-        return self.watch.status(self.last_error, **counted)
+        names = "num_rollouts", "num_env_steps", "num_replaced"
+        return self.watch.status(self.last_error, **{name: getattr(self, name) for name in names})
 
 
 class ActorPool:
@@ -185,6 +187,7 @@ class ActorPool:
             self._incarnations[slot.index] = slot.watch.incarnation
         new = self._spawn(slot.index)
         new.num_rollouts, new.num_env_steps = slot.num_rollouts, slot.num_env_steps
+        new.num_replaced = slot.num_replaced + (reason is not None)
         new.last_error = reason or slot.last_error
         if not slot.alive:
             new.may_start_s = 2.0 * slot.may_start_s

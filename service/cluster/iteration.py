@@ -46,7 +46,7 @@ class OpenIteration:
     """Failed attempts, by worker."""
     updated: tuple[Metrics, list[bool]] | None = None
     """See ``LearnerActor.update_from``."""
-    recorded: tuple[Iteration, GoalGrid, bool, bool] | None = None
+    recorded: tuple[Iteration, GoalGrid, bool] | None = None
     """See ``GeneratorActor.record_from``."""
 
 

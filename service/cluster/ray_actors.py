@@ -87,34 +87,36 @@ class RolloutActor(RolloutWorker, Watched):
 class GeneratorActor(GeneratorWorker, Watched):
     """A task generator that hands its whole state back with every record."""
 
-    @ray.method(num_returns=4)
-    def start(self, references: Sequence[Any]) -> tuple[Location, Arrays, GeneratorSnapshot, Opponents]:
+    @ray.method(num_returns=5)
+    def start(self, references: Sequence[Any]) -> tuple[Location, Arrays, GeneratorSnapshot, bool, Opponents]:
         """Continue from a state, given as the only one of the object references.
 
         Returns:
-            Where it is, and its state, snapshot and past players before the next iteration.
+            Where it is, and its state, snapshot, whether the run should stop, and past players before the next
+            iteration.
         """
         (state,) = _fetch(references)
         if state is not None:
             self.generator.load_state(state)
-        return self.ping(), self.generator.state(), self.generator.snapshot(), self.generator.opponents
+        made = self.generator.state(), self.generator.snapshot(), self.generator.should_stop()
+        return self.ping(), *made, self.generator.opponents
 
-    @ray.method(num_returns=4)
+    @ray.method(num_returns=5)
     def record_from(
         self, iteration: int, num_env_steps: int, weights: Weights, references: Sequence[Any]
-    ) -> tuple[tuple[Iteration, GoalGrid, bool, bool], Arrays, GeneratorSnapshot, Opponents | None]:
+    ) -> tuple[tuple[Iteration, GoalGrid, bool], Arrays, GeneratorSnapshot, bool, Opponents | None]:
         """Learn from an iteration's goals, given as object references; see ``GeneratorWorker.record``.
 
         Returns:
-            Its part of the iteration with the goal grid after it, whether the run should stop and whether there are
-            other past players; the generator's whole state, a snapshot for the next rounds, and those past players.
+            Its part of the iteration with the goal grid after it and whether there are other past players; then what
+            ``start`` gives beside the location, with None for past players that are the same.
         """
         before = self.generator.opponents.version
         recorded = self.record(iteration, weights, _fetch(references))
         opponents = self.generator.opponents
         has_new = opponents.version != before
-        answer = recorded, self.grid(iteration + 1, num_env_steps), self.generator.should_stop(), has_new
-        return answer, self.generator.state(), self.generator.snapshot(), opponents if has_new else None
+        made = self.generator.state(), self.generator.snapshot(), self.generator.should_stop()
+        return (recorded, self.grid(iteration + 1, num_env_steps), has_new), *made, opponents if has_new else None
 
 
 class LearnerActor(Watched):

@@ -70,6 +70,15 @@ def parse_status(text: str | None, token: str | None) -> StatusOptions | None:
     return StatusOptions(host.strip("[]"), int(port), token)
 
 
+def num_gpus(device: str) -> int:
+    """GPUs that a learner asks Ray for; an actor that asks for none sees none."""
+    import ray
+
+    if device == "auto":
+        return int(ray.cluster_resources().get("GPU", 0.0) >= 1.0)
+    return int(device == "cuda")
+
+
 @contextmanager
 def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None]:
     """Be a driver of a Ray cluster, for as long as the block runs.

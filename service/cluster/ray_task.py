@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -9,7 +10,7 @@ import ray
 from ray.exceptions import RayError, TaskCancelledError
 
 from service.base.errors import one_line
-from service.cluster.self_play import num_gpus
+from service.cluster.ray_connection import num_gpus
 from service.runs.study_run import END_NOW, GO_ON, POLL_S, STOP, Asked, Job, Place, StudyRun, run_process
 
 MAX_RETRIES = 3
@@ -42,6 +43,8 @@ def run_as_task(job: Job, asked: Asked) -> StudyRun:
 
 def run_here(job: Job) -> StudyRun:
     """Train on this machine until the run ends, or until the task is cancelled and the run has saved."""
+    # Ray's own are the cores of the task: threads of NumPy's and torch's would fight with those that step the worlds.
+    os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     is_canceled, asked = ray.get_runtime_context().is_canceled, GO_ON
     with ThreadPoolExecutor(1) as threads:
         process = threads.submit(run_process, job, lambda: asked)

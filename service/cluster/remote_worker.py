@@ -124,7 +124,7 @@ class RemoteWorker:
 
     def status(self) -> ActorStatus:
         """Its state for the status service."""
-        return self.watch.status(self._last_error)
+        return self.watch.status(self._last_error, num_replaced=self.watch.incarnation)
 
     def _spawn(self, incarnation: int) -> None:
         """Make its next process, which need not be up."""

@@ -34,10 +34,11 @@ from service.actors.evaluation import evaluated_goals
 from service.actors.rollout import MAX_POLICY_LAG, from_arrays
 from service.base.errors import DivergedError
 from service.base.types import Metrics
+from service.base.user_code import CodeError
 from service.cluster.actor_pool import ActorPool, ActorSlot
 from service.cluster.iteration import OpenIteration, Round, may_begin, may_update
 from service.cluster.ray_actors import GeneratorActor, LearnerActor, remote_actor
-from service.cluster.ray_connection import ClusterOptions, last_line
+from service.cluster.ray_connection import ClusterOptions, last_line, num_gpus
 from service.cluster.remote_worker import POLL_S, RemoteWorker, lost, take_copies
 from service.cluster.watch import Clock, RayletWatch
 from service.config.self_play import SelfPlayConfig
@@ -195,7 +196,7 @@ class RaySelfPlay(SelfPlay):
         self._to_close.clear()
 
     def _worker(self, name: str, actor: Any) -> RemoteWorker:
-        worker = RemoteWorker(name, actor, self.config, self._begun.get(name), self._clock, lambda: self.on_wait())
+        worker = RemoteWorker(name, actor, self.config, self._begun.get(name), self._clock, self.on_wait)
         self._to_close.append(worker.close)
         return worker
 
@@ -224,7 +225,7 @@ class RaySelfPlay(SelfPlay):
         try:
             if slot.starting in ready:
                 slot.watch.location, slot.starting = ray.get(slot.starting), None
-                if slot.watch.incarnation > 0:
+                if slot.num_replaced:
                     _logger.info("rollout actor %d is back, as its incarnation %d", slot.index, slot.watch.incarnation)
             for reference in ready.intersection(slot.evaluations):
                 self._evaluated |= slot.finish_evaluation(reference)
@@ -234,6 +235,8 @@ class RaySelfPlay(SelfPlay):
         except (DivergedError, PolicyError):
             raise
         except Exception as error:  # whatever happened on another machine
+            if isinstance(error, RayTaskError) and isinstance(error.cause, CodeError):
+                raise error.cause from None  # every other actor has the same file of a user's
             reason = last_line(error)
             if lost(error):
                 raise StateLostError(f"weights or goals went with the machine that kept them ({reason})") from None
@@ -330,7 +333,7 @@ class RaySelfPlay(SelfPlay):
         assert iteration.updated is not None
         assert iteration.recorded is not None
         learned, taken = iteration.updated
-        recorded, self._grid, self.converged, has_new_opponents = iteration.recorded
+        recorded, self._grid, has_new_opponents = iteration.recorded
         now = time.monotonic()
         elapsed_s, self._last_iteration = now - self._last_iteration, now
         self._version = int(learned["learner/version"])
@@ -352,7 +355,8 @@ class RaySelfPlay(SelfPlay):
     def _hand_out(self, *, has_new_opponents: bool) -> None:
         """Let the next rounds and workers have what learner and generator have made; copies of what is older go."""
         self._weights, self._learner.state = self._learner.made
-        self._generator.state, self._snapshot, opponents = self._generator.made
+        self._generator.state, self._snapshot, should_stop, opponents = self._generator.made
+        self.converged = _fetch(should_stop)
         if has_new_opponents:
             self._opponents = opponents
         needed = [self._weights, self._snapshot, self._opponents, self._generator.state, self._learner.state]
@@ -383,13 +387,6 @@ class RaySelfPlay(SelfPlay):
             return self._options.num_actors
         cores = ray.cluster_resources().get("CPU", 0.0) - self._options.learner_cpus
         return max(1, int(cores // self._options.actor_threads))
-
-
-def num_gpus(device: str) -> int:
-    """GPUs that the learner asks Ray for; an actor that asks for none sees none."""
-    if device == "auto":
-        return int(ray.cluster_resources().get("GPU", 0.0) >= 1.0)
-    return int(device == "cuda")
 
 
 def _fetch(state: Any) -> Any:

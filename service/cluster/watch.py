@@ -97,7 +97,7 @@ class Watch:
 
     def end(self) -> None:
         """Note that it has answered a call."""
-        self._num_calls = max(0, self._num_calls - 1)
+        self._num_calls -= 1
         self._bound_s = STALL_S
         self._began = self._moved = self._clock.now
         self.heartbeat = datetime.now(UTC)

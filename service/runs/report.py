@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 from types import TracebackType
 from typing import Any, Literal, Self
 
@@ -46,6 +46,7 @@ class Report:
         previous: the last status of an earlier process, whose totals go on. How far that came, and what a task has
             come to, stays until the run goes on: it may be refused.
         epoch: number of this process among those that ever ran the run.
+        options: of the command that goes on with it.
     """
 
     def __init__(
@@ -58,8 +59,9 @@ class Report:
         published: str | None = None,
         previous: RunStatus | None = None,
         epoch: int = 0,
+        options: Sequence[str] = (),
     ) -> None:
-        self._writer = writer
+        self._writer, self._lock = writer, Lock()
         self._totals = previous.totals.model_dump() if previous is not None else {}
         self._counted: dict[str, int] = {}
         self._gridded_s = float("-inf")
@@ -83,6 +85,7 @@ class Report:
             heartbeat=now,
             epoch=epoch,
             total_env_steps=config.run.total_env_steps,
+            options=tuple(options),
             trial=trial,
             published=published,
         )
@@ -117,7 +120,7 @@ class Report:
             while not over.wait(BEAT_S):
                 if (now := work_done()) != done:
                     done = now
-                    self._tell()
+                    self.alive()
 
         thread = Thread(target=beat, name="heartbeat", daemon=True)
         thread.start()
@@ -178,6 +181,10 @@ class Report:
             warnings=health.warnings,
         )
 
+    def alive(self) -> None:
+        """Tell that the process of the run lives, of which nothing else is new."""
+        self._tell()
+
     def measured(self, metrics: Mapping[str, float]) -> None:
         """Tell how well the run does in the end; of a task that is shown beside its name."""
         trial = self._status.trial
@@ -200,13 +207,14 @@ class Report:
             "env_steps": run.num_env_steps,
             "rollouts_counted": health.num_rollouts_counted,
             "rollouts_refused": health.num_rollouts_refused,
-            "replacements": sum(actor.incarnation for actor in health.actors),
+            "replacements": sum(actor.num_replaced for actor in health.actors),
         }
 
     def _tell(self, **changes: Any) -> None:
-        troubles = self._writer.troubles()
-        condition = max((each.condition for each in troubles), key=CONDITIONS.index, default="well")
-        warnings = (*(each.text for each in troubles), *changes.pop("warnings", ()))
-        changes |= {"heartbeat": datetime.now(UTC), "condition": condition, "warnings": warnings}
-        self._status = self._status.model_copy(update=changes)
-        self._writer.status(self._status)
+        with self._lock:  # ``beating`` has a thread of its own
+            troubles = self._writer.troubles()
+            condition = max((each.condition for each in troubles), key=CONDITIONS.index, default="well")
+            warnings = (*(each.text for each in troubles), *changes.pop("warnings", ()))
+            changes |= {"heartbeat": datetime.now(UTC), "condition": condition, "warnings": warnings}
+            self._status = self._status.model_copy(update=changes)
+            self._writer.status(self._status)

@@ -54,6 +54,7 @@ class Run:
         make: makes the method, once the directory is this process's.
         resume: continue from the newest checkpoint instead of starting anew.
         parent: version that a new run begins from.
+        on_beat: called about every second while its method starts.
 
     Raises:
         TandemError: see ``RunDirectory.claim``; or the method cannot be made.
@@ -68,6 +69,7 @@ class Run:
         *,
         resume: bool = False,
         parent: Published | None = None,
+        on_beat: OnBeat = lambda: None,
     ) -> None:
         directory.claim(resume=resume)
         self.config, self.directory = config, directory
@@ -82,7 +84,7 @@ class Run:
         self._stop_requested, self._num_idle = False, 0
         self._ending: Ending | None = None
         self._on_iteration: OnIteration = lambda metrics: None
-        self._on_beat: OnBeat = lambda: None
+        self._on_beat = on_beat
         saved = self._load() if resume else None
         self._origin = origin_of(type(config))
         """Of a method of a user's, its file."""

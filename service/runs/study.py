@@ -19,6 +19,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from pydantic import Field, ValidationError
@@ -55,6 +56,7 @@ class StudyFile(FrozenModel):
     runs: dict[str, StudyRun]
     best: str | None = Field(None, description="name of the best run")
     published: str | None = Field(None, description="version of its primitives")
+    options: tuple[str, ...] = Field((), description="of the command that goes on, which no other file has")
 
 
 class Study:
@@ -162,6 +164,7 @@ class Study:
         options: Sequence[str],
         signals: StopSignals,
         progress: Progress,
+        typed: Sequence[str] = (),
     ) -> None:
         """Run all runs that have not ended, several at once.
 
@@ -174,6 +177,7 @@ class Study:
             options: of ``tandem train`` for every run.
             signals: of this process.
             progress: shows how far they are.
+            typed: options of the command that goes on; ``study.json`` keeps them.
 
         Raises:
             InterruptError: a second signal.
@@ -182,8 +186,10 @@ class Study:
         jobs, num_parallel = self._jobs(configs, place, parallel, options)
         if not jobs:
             return
+        self._write(self._study.model_copy(update={"options": tuple(typed)}))
         progress.say(f"runs to go: {len(jobs)}, at once: {num_parallel}")
         reader, shown, shown_s = DiskReader(self.path), dict.fromkeys(jobs, 0), float("-inf")
+        show = partial(self._show, reader, shown, configs, progress)
         asked = GO_ON
 
         def stop() -> None:
@@ -203,15 +209,16 @@ class Study:
                         for name, thread in list(going.items()):
                             if thread.done():
                                 del going[name]
+                                show([name])
                                 if (found := thread.result()) is not None:
                                     self._note(name, found)
                                     why = f": {found.error}" if found.error else ""
                                     progress.say(f"{name}: {found.state} after {found.env_steps:,} env steps{why}")
                             elif thread.running() and self._study.runs[name].state != "running":
                                 self._note(name, self._study.runs[name].now("running"))
-                        if time.monotonic() - shown_s >= SHOW_S or not going:
+                        if time.monotonic() - shown_s >= SHOW_S:
                             shown_s = time.monotonic()
-                            self._show(reader, shown, configs, progress)
+                            show([name for name in going if self._study.runs[name].state == "running"])
             finally:
                 asked = END_NOW
                 for name in going:
@@ -285,10 +292,15 @@ class Study:
         write_atomic(self.file, study.model_dump_json(indent=1).encode() + b"\n")
 
     def _show(
-        self, reader: DiskReader, shown: dict[str, int], configs: Mapping[str, Config], progress: Progress
+        self,
+        reader: DiskReader,
+        shown: dict[str, int],
+        configs: Mapping[str, Config],
+        progress: Progress,
+        names: Iterable[str],
     ) -> None:
-        """Show the records that runs have written since the last iterations that were shown."""
-        for name in shown:
+        """Show the records that these runs have written since the last iterations that were shown."""
+        for name in names:
             with suppress(StoreError):  # it has not begun, is elsewhere, or the disk is away for a moment
                 for record in reader.metrics(run_id_of(self.path / name), after_iteration=shown[name]):
                     shown[name] = int(record["iteration"] or 0)

@@ -117,7 +117,7 @@ def run_process(job: Job, asked: Asked) -> StudyRun:
             return found
         code, told = _wait_for(_start(job), asked)
         found = job.left()
-    except TandemError as error:  # its directory cannot be used; the other runs go on
+    except (TandemError, OSError) as error:  # no process for it, or its directory cannot be used; the others go on
         return job.run.now("failed", str(error))
     if code in (0, *(128 + number for number in STOPPING)) or (told and -code in STOPPING):
         return found

@@ -7,7 +7,7 @@ import os
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -34,7 +34,7 @@ from service.registry.names import Version, check_name
 from service.registry.publishing import check_publishable, measure_bob, measure_skills, publish_run
 from service.registry.registry import Registry
 from service.runs.report import Report
-from service.runs.run import Ending, OnIteration, Run
+from service.runs.run import Ending, OnBeat, OnIteration, Run
 from service.runs.signals import InterruptError, StopSignals
 from service.store.address import address_from_environment
 from service.store.checkpoints import CheckpointStore
@@ -113,6 +113,7 @@ def train(
     on_iteration: OnIteration,
     runtime: Runtime | None = None,
     start: Trained | None = None,
+    options: Sequence[str] = (),
 ) -> Finished:
     """Train to the end, then evaluate, publish, draw and record a video.
 
@@ -128,6 +129,7 @@ def train(
         on_iteration: called with the metrics of every iteration; what it returns, if anything, ends the run.
         runtime: where its workers are; None: in this process.
         start: what a new run begins from (``service.load``); a resumed one has begun already.
+        options: of the command that goes on with it, besides directory and registry, for the page.
 
     Raises:
         TandemError: see ``Run`` and ``RunDirectory.start``; or a registry that is only read; or of a new run a Redis
@@ -147,7 +149,10 @@ def train(
         previous = read_status(directory.path) if resume else None
         writer = reporting_to(directory, run_id, address_from_environment(), resumed=resume)
         published, epoch = last.version if last is not None else None, directory.epoch
-        report = Report(config, run_id, runtime.name, writer, published=published, previous=previous, epoch=epoch)
+        report = Report(
+            config, run_id, runtime.name, writer,
+            published=published, previous=previous, epoch=epoch, options=options,
+        )  # fmt: skip
         log = stack.enter_context(logging_to(directory.path))
         begins = "goes on with" if resume else "begins"
         log(f"process {os.getpid()} on {socket.gethostname()} {begins} the run ({runtime.name} runtime)")
@@ -158,7 +163,9 @@ def train(
             reached = -1
             try:
                 with doing("starting", aloud=False):
-                    begun = open_run(config, directory, registry, resume=resume, start=start, runtime=runtime)
+                    begun = open_run(
+                        config, directory, registry, resume=resume, start=start, runtime=runtime, on_beat=report.alive
+                    )
                 with closing(begun) as run:
                     try:
                         done = _run(run, registry, publish, signals, report, on_iteration)
@@ -187,10 +194,12 @@ def open_run(
     resume: bool = False,
     start: Trained | None = None,
     runtime: Runtime | None = None,
+    on_beat: OnBeat = lambda: None,
 ) -> Run:
-    """Begin or continue a run, of which nothing is reported; see ``train``."""
+    """Begin or continue a run, of which nothing is reported; see ``train`` and ``Run``."""
     make = partial((runtime or Runtime()).make, config, registry, start)
-    return Run(config, directory, make, resume=resume, parent=start.published if start is not None else None)
+    parent = start.published if start is not None else None
+    return Run(config, directory, make, resume=resume, parent=parent, on_beat=on_beat)
 
 
 def prepare(

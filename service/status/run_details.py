@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from service.base.errors import ConfigError, StorageError
-from service.base.files import last_lines, open_regular
+from service.base.files import last_lines, open_regular, read_regular
 from service.base.parsing import ParseError, parse_json
 from service.config.run import CELL_SIZE_M
 from service.config.tree import read_yaml
 from service.generator.records import of_furthest
 from service.status.schemas import GoalFrame, GoalFrames, RunCommand, RunLog, RunSetup
 from service.store.disk_reader import is_study
-from service.store.models import ACTIVE, OUTPUT_FILE, GoalGrid, RunStatus
+from service.store.models import ACTIVE, MAX_BYTES, OUTPUT_FILE, STUDY_FILE, GoalGrid, RunStatus
 from service.store.run_history import read_history
 from service.store.run_log import LogLine, read_log
 
@@ -36,17 +36,25 @@ def setup(run: RunStatus, directory: Path | None, registry: Path) -> RunSetup:
         problem = str(error) if file.exists() else f"{file} is not there: the run has only begun, or it was removed"
     path = directory.absolute()
     place = ["--registry", str(registry.absolute())]
-    begun = path.parent if is_study(path.parent) else path
-    runtime = ["--runtime", "ray"] * (run.runtime == "ray")
+    begun, options = (path.parent, _study_options(path.parent)) if is_study(path.parent) else (path, run.options)
     return RunSetup(
         run_id=run.run_id,
         directory=str(path),
         config=config,
         problem=problem,
         stop_command=shlex.join(["touch", str(path / "stop")]),
-        resume_command=shlex.join(["tandem", "train", "--resume", "--run-dir", str(begun), *place, *runtime]),
+        resume_command=shlex.join(["tandem", "train", "--resume", "--run-dir", str(begun), *place, *options]),
         commands=_uses(run, path, place, config) if config is not None and run.state not in ACTIVE else (),
     )
+
+
+def _study_options(path: Path) -> list[str]:
+    """Options of the command that goes on with a study."""
+    try:
+        found = parse_json(read_regular(path / STUDY_FILE, MAX_BYTES), STUDY_FILE)["options"]
+        return [str(each) for each in found]
+    except (OSError, ParseError, KeyError, TypeError):  # the study itself says what is wrong with its file
+        return []
 
 
 def _uses(run: RunStatus, path: Path, place: list[str], config: dict[str, Any]) -> tuple[RunCommand, ...]:

@@ -61,7 +61,7 @@ def task_table(statuses: Iterable[RunStatus], directories: Mapping[str, Path]) -
         path = directories.get(status.run_id)
         try:
             if path is not None and status.trial is not None:
-                runs.append(_read(status.run_id, status.trial, path))
+                runs.append(_read(status, status.trial, path))
         except FileNotFoundError:  # it has only begun, or is deleted just now
             continue
         except OSError as error:
@@ -91,11 +91,15 @@ def task_table(statuses: Iterable[RunStatus], directories: Mapping[str, Path]) -
     )
 
 
-def _read(run_id: str, trial: Trial, path: Path) -> _Run:
+def _read(status: RunStatus, trial: Trial, path: Path) -> _Run:
     """A run that learns a task. Its configuration is taken as data: no method of a user's own is imported."""
     config = path / "config.yaml"
     settings = _settings(config, config.stat().st_mtime_ns)
     result = RunDirectory(path).read_result()
+    if result is not None:
+        goes_on = result["env_steps"] < status.total_env_steps  # it is of a shorter training
+        if goes_on or not {"success_last", "num_episodes"} <= result["evaluation"].keys():
+            result = None
     ended = (path / RESULT_FILE).stat().st_mtime if result is not None else 0.0
     made = {} if result is None else result.get("made", {})
     version = settings.get("task_version")
@@ -106,7 +110,7 @@ def _read(run_id: str, trial: Trial, path: Path) -> _Run:
         if _counts(key)
     }
     counted["learning_version"] = LEARNING_VERSION if result is None else made.get("learning_version", 1)
-    return _Run(run_id, trial, column, counted, ended, result)
+    return _Run(status.run_id, trial, column, counted, ended, result)
 
 
 def _counts(key: str) -> bool:

@@ -2,7 +2,7 @@
 
 | key | type | content |
 |---|---|---|
-| ``tandem:runs`` | sorted set | run ids by when they were last started, in seconds since 1970 |
+| ``tandem:runs`` | sorted set | run ids by when they last reported, in seconds since 1970 |
 | ``tandem:run:ID:status`` | string | ``RunStatus`` as JSON |
 | ``tandem:run:ID:metrics`` | sorted set | records as JSON by iteration, the newest ``MAX_RECORDS`` |
 | ``tandem:run:ID:goals`` | string | ``GoalGrid`` as JSON |
@@ -10,7 +10,7 @@
 | ``tandem:run:ID:heartbeat`` | string, expires | is there until ``HEARTBEAT_S`` after its process last reported |
 | ``tandem:run:ID:epoch`` | string | ``RUN:EPOCH``: identity of the run and number of the process that reports |
 
-A run's keys go ``KEPT_S`` after its last report.
+A run's keys go ``KEPT_S`` after its last report, and so does its id.
 
 Records are in a sorted set and no stream: written twice, as after an answer that got lost, a record is there once, and
 a resumed run's takes the place of the earlier one.

@@ -49,6 +49,7 @@ class CheckpointStore:
     def __init__(self, directory: Path, keep: int, *, epoch: int = 0) -> None:
         assert keep >= 1
         self.directory, self.keep, self.epoch = directory, keep, epoch
+        self._damaged: set[Path] = set()
 
     def path(self, step: int) -> Path:
         """File to which this process writes the checkpoint of ``step``, there or not."""
@@ -118,6 +119,7 @@ class CheckpointStore:
                 checkpoint = read_checkpoint(path)
             except CheckpointError as error:
                 reasons.append(str(error))
+                self._damaged.add(path)
                 continue
             for reason in reasons:
                 _logger.warning("%s; continuing from %s", reason, path.name)
@@ -125,11 +127,12 @@ class CheckpointStore:
         raise CheckpointError(f"no usable checkpoint in {self.directory}: {'; '.join(reasons)}; start the run anew")
 
     def _prune(self, newest: int) -> None:
-        # a file above the one just written is a damaged one that was passed over: it must not crowd out a good one
-        # and what another process writes in a higher epoch is not for this one to delete
-        remaining = [path for epoch, step, path in self._files() if (epoch, step) <= (self.epoch, newest)]
+        # What another process writes in a higher epoch is not for this one to delete, and a damaged file that was
+        # passed over, of whatever epoch and step, must not crowd out a good one.
+        files = [path for epoch, step, path in self._files() if (epoch, step) <= (self.epoch, newest)]
+        oldest = [path for path in files if path not in self._damaged][-self.keep :][0]
         try:
-            for path in remaining[: -self.keep]:
+            for path in files[: files.index(oldest)]:
                 path.unlink(missing_ok=True)
             remove_temporaries(self.directory)
         except OSError as error:

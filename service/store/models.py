@@ -92,7 +92,8 @@ class ActorStatus(FrozenModel):
     """One rollout actor, the learner or the task generator, as its run sees it."""
 
     name: str = Field(description="rollout-0, rollout-1, ..., learner, generator")
-    incarnation: int = Field(ge=0, description="how often it was replaced")
+    incarnation: int = Field(ge=0, description="which of its processes this is; those before a resume count, too")
+    num_replaced: int = Field(0, ge=0, description="how often it was replaced since the run was last started")
     state: Literal["starting", "alive"]
     node: str = Field("", description="host it is on; empty in a run of one process")
     pid: int | None = None
@@ -132,6 +133,7 @@ class RunStatus(FrozenModel):
     iteration: int = Field(0, ge=0)
     num_env_steps: int = Field(0, ge=0)
     total_env_steps: int = Field(ge=1, description="its budget")
+    options: tuple[str, ...] = Field((), description="of the command that goes on with it, which no other file has")
     env_steps_per_s: float = Field(0.0, ge=0)
     policy_version: int = Field(0, ge=0)
     policy_lag: float = Field(0.0, ge=0, description="mean over the last update's rollouts, in versions")

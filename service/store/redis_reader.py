@@ -9,7 +9,7 @@ from typing_extensions import override
 
 from service.base.errors import DamagedStoreError, UnknownRunError
 from service.base.parsing import ParseError, parse_with
-from service.store.address import RUNS, Content, RedisAddress, run_key
+from service.store.address import KEPT_S, RUNS, Content, RedisAddress, run_key
 from service.store.models import ACTIVE, SILENT_AFTER, Columns, GoalGrid, Pulse, Record, RunReader, RunStatus
 from service.store.tail import Table, parse_record
 
@@ -93,7 +93,7 @@ class RedisReader(RunReader):
     def request_stop(self, run_id: str) -> None:
         if self.run(run_id).state in ACTIVE:
             with self._address.errors():
-                self._client.set(run_key(run_id, "stop"), b"1")
+                self._client.set(run_key(run_id, "stop"), b"1", ex=KEPT_S)
 
     @override
     def ready(self) -> None:

@@ -185,7 +185,8 @@ class RedisWriter:
                 if value is not self._there.get(content):
                     pipe.set(self._key(content), value.model_dump_json())
                 if isinstance(value, RunStatus):
-                    pipe.zadd(keys.RUNS, {self._run_id: value.started.timestamp()})
+                    pipe.zadd(keys.RUNS, {self._run_id: time.time()})
+                    pipe.zremrangebyscore(keys.RUNS, "-inf", time.time() - keys.KEPT_S)
             key = self._key("metrics")
             for iteration, text in records:
                 pipe.zremrangebyscore(key, iteration, "+inf")

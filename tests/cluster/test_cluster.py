@@ -19,10 +19,10 @@ from benchmarks.processes import descendants
 from service.base.errors import ConfigError
 from service.cluster import actor_pool, self_play, watch
 from service.cluster.ray_actors import NICENESS
-from service.cluster.ray_connection import ClusterOptions, connected, explaining_ray_errors
+from service.cluster.ray_connection import ClusterOptions, connected, explaining_ray_errors, num_gpus
 from service.cluster.ray_runtime import RayRuntime
 from service.cluster.remote_worker import RemoteWorker
-from service.cluster.self_play import RaySelfPlay, num_gpus
+from service.cluster.self_play import RaySelfPlay
 from service.cluster.watch import RayletWatch
 from service.cluster.worker_variables import WORKER_VARIABLES
 from service.config import changed_config
@@ -225,7 +225,7 @@ def test_workers_that_are_killed_are_replaced_and_no_others(tmp_path, monkeypatc
             doomed.extend({"learner"}.intersection(names))
             killed.extend(send(run, name, signal.SIGKILL) for name in names)
         yield from all_there(run, 5, killed)
-        incarnations.update({name: actor.incarnation for name, actor in workers_of(run).items()})
+        incarnations.update({name: actor.num_replaced for name, actor in workers_of(run).items()})
 
     run, result = run_cluster(tmp_path, story=strike)
     assert result.reason == "interrupted"

@@ -4,14 +4,17 @@ from types import SimpleNamespace
 
 import pytest
 import ray
-from ray.exceptions import ActorDiedError
+from ray.exceptions import ActorDiedError, RayTaskError
 
 from service.actors.rollout import MAX_POLICY_LAG
-from service.cluster import actor_pool
+from service.base.user_code import CodeError
+from service.cluster import actor_pool, ray_actors
 from service.cluster.actor_pool import RESTART_S, ActorPool
 from service.cluster.iteration import may_begin, may_update
+from service.cluster.ray_actors import GeneratorActor
 from service.cluster.ray_connection import ClusterOptions
 from service.cluster.self_play import MAX_FAILED_ROUNDS, RaySelfPlay
+from service.generator.generator import TaskGenerator
 from service.methods.method import WorkersError
 from tests.runs.runs import tiny_config
 
@@ -89,11 +92,42 @@ def test_a_start_that_waits_for_a_core_is_no_failure_and_one_that_dies_is(method
     (again,) = method._pool
     assert again is not first
     assert (again.watch.incarnation, again.last_error, method._last_error) == (0, None, None)
+    assert again.status().num_replaced == 0
     method._take_from_actor(again, {again.starting})
     (replaced,) = method._pool
-    assert replaced.watch.incarnation == 1
+    assert replaced.watch.incarnation == replaced.status().num_replaced == 1
     assert "died" in replaced.last_error
     method._clock.now *= 10.0
     method._check_workers()
     (last,) = method._pool
     assert (last.watch.incarnation, last.last_error) == (1, replaced.last_error)
+
+
+def test_actors_that_join_a_resumed_run_do_not_count_as_replaced(method):
+    pool = ActorPool(method.config, 1, 5, method._clock)
+    pool.resize(2)
+    assert [(slot.status().incarnation, slot.status().num_replaced) for slot in pool] == [(5, 0), (5, 0)]
+
+
+def test_an_error_in_code_of_a_users_ends_the_run(method, monkeypatch):
+    def fails(reference):
+        raise RayTaskError("play_round", "its traceback", CodeError("mine.py:3: NameError"))
+
+    method._pool.resize(1)
+    (slot,) = method._pool
+    slot.round = SimpleNamespace(answer="answer", started=0.0)
+    monkeypatch.setattr(ray, "get", fails)
+    with pytest.raises(CodeError, match=r"^mine\.py:3: NameError$"):
+        method._take_from_actor(slot, {"answer"})
+
+
+def test_a_run_that_had_converged_has_converged_when_it_goes_on(method, monkeypatch):
+    monkeypatch.setattr(ray_actors, "_fetch", list)
+    monkeypatch.setattr(TaskGenerator, "should_stop", lambda generator: True)
+    *_, should_stop, _ = GeneratorActor(method.config).start([None])
+    method._learner = SimpleNamespace(made=["weights", "learner"])
+    method._generator = SimpleNamespace(made=["generator", "snapshot", should_stop, "opponents"])
+    monkeypatch.setattr(ray, "get", lambda value: value)
+    assert not method.converged
+    method._hand_out(has_new_opponents=True)
+    assert method.converged

@@ -13,9 +13,10 @@ import pytest
 from service.base import lock
 from service.base.errors import DivergedError, RunTakenError, StoreUnavailableError, TandemError
 from service.base.lock import claim_epoch
-from service.methods.self_play import SelfPlay
+from service.methods.self_play import LocalSelfPlay, SelfPlay
 from service.registry.registry import Registry
 from service.runs import report
+from service.runs import run as runs_run
 from service.runs import train as module
 from service.runs.resuming import resumed_config
 from service.runs.signals import InterruptError
@@ -64,6 +65,24 @@ def run(tmp_path, config=None, *, resume=False, on_iteration=lambda metrics: Non
 
 def status(tmp_path):
     return DiskReader(tmp_path / "runs").run("cube")
+
+
+def test_a_run_whose_workers_start_for_long_is_alive(tmp_path, monkeypatch):
+    start, seen = LocalSelfPlay.start, []
+
+    def start_slowly(method, state=None):
+        for _ in range(2):
+            seen.append(status(tmp_path))
+            method.on_wait()
+        seen.append(status(tmp_path))
+        start(method, state)
+
+    monkeypatch.setattr(LocalSelfPlay, "start", start_slowly)
+    monkeypatch.setattr(runs_run, "BEAT_S", 0.0)
+    monkeypatch.setattr(run_writer, "STATUS_INTERVAL_S", 0.0)
+    run(tmp_path)
+    assert [each.state for each in seen] == ["starting"] * 3
+    assert seen[0].heartbeat < seen[1].heartbeat < seen[2].heartbeat
 
 
 def test_a_run_tells_how_far_it_is_and_how_it_ended(tmp_path):

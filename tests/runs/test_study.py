@@ -1,6 +1,7 @@
 """Studies: seeds, grids, cores, intervals, which run is the best, and real ones through kills, signals and resumes."""
 
 import csv
+import errno
 import io
 import json
 import os
@@ -341,6 +342,16 @@ def test_how_the_process_of_a_run_ends(tmp_path, monkeypatch, script, asked, sta
     found = run_process(job, lambda: asked if log.exists() and "ready" in log.read_text() else GO_ON)
     assert (found.state, found.error is None) == (state, error is None)
     assert error is None or error in found.error
+
+
+def test_a_machine_that_has_no_process_for_a_run_fails_that_run_alone(tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    job = Job(tmp_path / "run", dump_config(tiny_config()), 600, StudyRun(settings={}))
+    found = run_process(job, lambda: GO_ON)
+    assert (found.state, os.strerror(errno.EAGAIN) in found.error) == ("failed", True)
 
 
 # --- a whole one -----------------------------------------------------------------------------------------------------

@@ -49,9 +49,11 @@ def status(run_id: str, **changes: Any) -> RunStatus:
             "replacements": 3,
         },
         "actors": (
-            ActorStatus(name="rollout-0", incarnation=2, state="alive", heartbeat=now, last_error="killed"),
+            ActorStatus(
+                name="rollout-0", incarnation=2, num_replaced=2, state="alive", heartbeat=now, last_error="killed"
+            ),
             ActorStatus(name="rollout-1", incarnation=0, state="starting", heartbeat=now),
-            ActorStatus(name="learner", incarnation=1, state="alive", heartbeat=now),
+            ActorStatus(name="learner", incarnation=1, num_replaced=1, state="alive", heartbeat=now),
         ),
     }
     return RunStatus(**(fields | changes))
@@ -150,7 +152,7 @@ def write_trial(
         result = {
             "evaluation": evaluation,
             "made": {"learning_version": LEARNING_VERSION},
-            "env_steps": 2000,
+            "env_steps": total,
             "wall_s": 9.0,
         }
         (path / "result.json").write_text(json.dumps(result))

@@ -114,6 +114,17 @@ def test_of_a_seed_that_was_run_twice_the_newer_counts(root):
     assert (cell.success, cell.run_ids, cell.unfinished) == (0.4, ("b",), ("night-c",))
 
 
+def test_a_result_of_a_shorter_training_or_of_something_else_is_none(root):
+    longer = write_trial(root, "a", "push", "ours", 0, 0.2, total_env_steps=4000)
+    other = write_trial(root, "b", "push", "ours", 1, 0.4, total_env_steps=4000)
+    write_trial(root, "c", "push", "ours", 2, 0.6, total_env_steps=4000)
+    for path, changed in ((longer, {"env_steps": 3000}), (other, {"evaluation": {"coverage": 0.5}})):
+        result = json.loads((path / "result.json").read_text())
+        (path / "result.json").write_text(json.dumps(result | changed))
+    (cell,) = table(root).rows[0].cells
+    assert (cell.success, cell.run_ids, cell.unfinished) == (0.6, ("c",), ("a", "b"))
+
+
 def test_what_is_damaged_or_unknown_hides_nothing_else(root):
     write_trial(root, "good", "push", "ours", 0, 0.4)
     write_trial(root, "future", "juggle", "telepathy", 0, 0.6, task_version=7)

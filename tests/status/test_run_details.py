@@ -37,11 +37,13 @@ def directory(tmp_path):
 
 
 def test_commands(directory, tmp_path):
-    found = run_details.setup(status("night", state="finished", runtime="local"), directory, tmp_path / "registry")
+    ended = status("night", state="finished", options=("--runtime", "ray", "--no-publish"))
+    found = run_details.setup(ended, directory, tmp_path / "registry")
     assert found.config == {"seed": 3}
     assert shlex.split(found.stop_command) == ["touch", str(directory / "stop")]
     place = ["--registry", str(tmp_path / "registry")]
-    assert shlex.split(found.resume_command) == ["tandem", "train", "--resume", "--run-dir", str(directory), *place]
+    begun = ["tandem", "train", "--resume", "--run-dir", str(directory)]
+    assert shlex.split(found.resume_command) == [*begun, *place, "--runtime", "ray", "--no-publish"]
     assert [shlex.split(each.command) for each in found.commands] == [
         ["tandem", *words, *place]
         for words in (
@@ -56,10 +58,16 @@ def test_commands(directory, tmp_path):
 
 def test_commands_of_a_run_of_a_study_go_on_with_the_study(directory, tmp_path):
     (directory.parent / "study.json").write_text("x: 1\n")
-    found = run_details.setup(status("night-seed-3"), directory, tmp_path / "registry")
-    words = shlex.split(found.resume_command)
-    assert words[words.index("--run-dir") + 1] == str(directory.parent)
-    assert words[-2:] == ["--runtime", "ray"]
+    run, registry = status("night-seed-3", options=("--no-publish",)), str(tmp_path / "registry")
+    place = ["tandem", "train", "--resume", "--run-dir", str(directory.parent), "--registry", registry]
+    for text, options in (
+        ("x: 1\n", []),
+        ("[]", []),
+        ('{"options": ["--runtime", "ray", "--address", "host:1"]}', ["--runtime", "ray", "--address", "host:1"]),
+    ):
+        (directory.parent / "study.json").write_text(text)
+        found = run_details.setup(run, directory, tmp_path / "registry")
+        assert shlex.split(found.resume_command) == [*place, *options]
 
 
 def test_a_configuration_that_cannot_be_read(tmp_path):

@@ -119,6 +119,19 @@ def test_a_damaged_newer_file_never_crowds_out_a_good_one(tmp_path: Path) -> Non
     assert store.steps() == [50]
 
 
+def test_a_damaged_file_of_an_earlier_process_never_crowds_out_a_good_one(tmp_path: Path) -> None:
+    before = CheckpointStore(tmp_path, keep=3, epoch=1)
+    for step in (5, 10, 15):
+        save(before, step)
+    flip_bit(before.path(15), -1)
+    store = CheckpointStore(tmp_path, keep=2, epoch=2)
+    assert store.load_latest().step == 10
+    save(store, 12)
+    assert store.steps() == [10, 15, 12]
+    save(store, 14)
+    assert store.steps() == [12, 14]
+
+
 def test_no_checkpoint_and_none_usable(store: CheckpointStore) -> None:
     with pytest.raises(CheckpointError, match=r"no checkpoint in .*checkpoints; .*without --resume"):
         store.load_latest()

@@ -110,8 +110,14 @@ def test_what_a_run_has_told_goes_some_time_after_its_last_report(redis, writer,
     wait_until(lambda: reader.runs() and iterations(reader) == [1, 2])
     writer.close()
     client = redis.address.client(1.0)
+    reader.request_stop("cube")
     for key in client.keys("tandem:run:cube:*"):
         assert 0 < client.ttl(key) <= address.KEPT_S, key
+    client.zadd(RUNS, {"cube": time.time() - address.KEPT_S - 1.0})
+    other = a_writer(redis.address, "other", run="b")
+    train(other, [1])
+    wait_until(lambda: client.zrange(RUNS, 0, -1) == [b"other"])
+    other.close()
 
 
 def test_stopped_for_a_while(redis, reader, monkeypatch):

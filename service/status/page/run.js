@@ -231,7 +231,7 @@ class ActorTable {
       [
         { label: "Actor", text: (actor) => actor.name },
         { label: "State", changed: (actor) => actor.state, node: (actor) => el("span", { class: `chip ${actor.state}` }, actor.state) },
-        { label: "Replaced", text: (actor) => count(actor.incarnation), number: true },
+        { label: "Replaced", text: (actor) => count(actor.num_replaced), number: true },
         { label: "Node", text: (actor) => actor.node || "this machine" },
         { label: "Heard of", changed: (actor) => actor.heartbeat, node: (actor) => age(actor.heartbeat) },
         { label: "Rollouts", text: (actor) => count(actor.num_rollouts), number: true },
