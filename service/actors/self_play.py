@@ -283,10 +283,11 @@ class SelfPlay:
     def _at_goals(self, goal: StateArray, reach_m: float) -> BoolArray:
         """(N, K) whether an object counts as at its goal, of (N, 3 K): within ``reach_m``.
 
-        What both fingers hold counts only once all others are there: he would hold the first one to the end.
+        What both fingers hold counts only once all others are there: he would hold the first one to the end. A gripper
+        that is blocked holds nothing.
         """
         there = distances(self.worlds.object_position, goal) <= reach_m
-        held = self.worlds.contacts().reshape(*there.shape, 2).all(axis=2)
+        held = self.worlds.contacts().reshape(*there.shape, 2).all(axis=2) & ~self.worlds.blocked[:, None]
         others_there = there.sum(axis=1, keepdims=True) - there == there.shape[1] - 1
         counted: BoolArray = there & (~held | others_there)
         return counted

@@ -96,6 +96,13 @@ class ObstacleConfig(ObjectConfig):
     color: Color = (0.90, 0.66, 0.20)
 
 
+class OneOfSeveralConfig(ObjectConfig):
+    """An object with a goal, beside others."""
+
+    mass_kg: float | None = Field(None, gt=0.0, le=5.0, description="None: ``object_mass_kg`` of the world")
+    friction: float | None = Field(None, gt=0.0, le=3.0, description="None: that of the world")
+
+
 COLORS: tuple[Color, ...] = ((0.86, 0.13, 0.11), (0.13, 0.36, 0.78), (0.18, 0.55, 0.27), (0.55, 0.30, 0.65))
 """Of objects that are only named, by their place: red, blue, green and purple."""
 
@@ -126,11 +133,11 @@ Object = Annotated[
     BeforeValidator(_read_mesh),
 ]
 """A name, or a description."""
-ObjectWithMass = Annotated[
-    Annotated[Literal["cube", "sphere"], Tag(NAMED)] | Annotated[ObstacleConfig, Tag(DESCRIBED)],
+OneOfSeveral = Annotated[
+    Annotated[Literal["cube", "sphere"], Tag(NAMED)] | Annotated[OneOfSeveralConfig, Tag(DESCRIBED)],
     Discriminator(lambda value: NAMED if isinstance(value, str) else DESCRIBED),
     BeforeValidator(_read_mesh),
 ]
-"""The same with its mass and friction."""
+"""The same; a description may have its own mass and friction."""
 Fixture = Annotated[FixtureConfig, BeforeValidator(_read_mesh)]
 Obstacle = Annotated[ObstacleConfig, BeforeValidator(_read_mesh)]

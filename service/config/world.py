@@ -10,7 +10,16 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from service.config.frozen import BUILT_IN, DESCRIBED, FrozenModel
-from service.config.objects import COLORS, Fixture, Object, ObjectWithMass, Obstacle, ObstacleConfig, simple_object
+from service.config.objects import (
+    COLORS,
+    Fixture,
+    Object,
+    Obstacle,
+    ObstacleConfig,
+    OneOfSeveral,
+    OneOfSeveralConfig,
+    simple_object,
+)
 from service.config.recipes import robots
 from service.config.robot import RobotConfig, read_robot
 
@@ -82,11 +91,10 @@ class RandomisationConfig(FrozenModel):
         32, ge=1, le=1024, description="in the bank; more cover the ranges more densely, and 64 cost 5 % of throughput"
     )
     object_size: Range | None = Field(None, description="factor of all sizes of the object")
-    object_mass_kg: Range | None = Field(
-        None, description="mass of the object; of several only of those that are named"
-    )
+    object_mass_kg: Range | None = Field(None, description="mass of the object; of several of those without their own")
     friction: Range | None = Field(
-        None, description="sliding friction of the object, also on the table; of several only of those that are named"
+        None,
+        description="sliding friction of the object, also on the table; of several of those without their own",
     )
     gain: Range | None = Field(None, description="factor of the stiffness of the arm's servos")
     damping: Range | None = Field(
@@ -141,7 +149,7 @@ class WorldConfig(FrozenModel):
         description="panda, a name of tandem configs, or a YAML file with a description of yours (docs/robots.md)",
     )
     object: Object = Field("cube", description="cube, sphere, or a description: shape, size_m, color (docs/objects.md)")
-    objects: tuple[ObjectWithMass, ...] = Field(
+    objects: tuple[OneOfSeveral, ...] = Field(
         (),
         max_length=len(COLORS),
         description="in place of object, several that each have a goal: cube, sphere, or a description, also of its "
@@ -180,22 +188,20 @@ class WorldConfig(FrozenModel):
     @model_validator(mode="before")
     @classmethod
     def _complete_objects(cls, values: Any) -> Any:
-        """Keep a list of one as the one object; give descriptions of several what they leave out, as to a name."""
+        """Keep a list of one as the one object; give descriptions of several a color, as to a name."""
         objects = values.get("objects") if isinstance(values, Mapping) else None
         if not isinstance(objects, list | tuple) or values.get("object", "cube") != "cube":
             return values
         rest = {key: value for key, value in values.items() if key != "objects"}
         if len(objects) != 1:
-            names = {"mass_kg": "object_mass_kg", "friction": "friction"}
-            usual = {key: values.get(name, cls.model_fields[name].default) for key, name in names.items()}
             filled = [
-                {**usual, "color": color, **each} if isinstance(each, Mapping) else each
+                {"color": color, **each} if isinstance(each, Mapping) else each
                 for each, color in zip(objects, cycle(COLORS), strict=False)
             ]
             return {**rest, "objects": filled}
         (only,) = objects
-        if isinstance(only, ObstacleConfig):
-            only = only.model_dump()
+        if isinstance(only, OneOfSeveralConfig):
+            only = only.model_dump(exclude_none=True)
         if not isinstance(only, Mapping):
             return {**rest, "object": only}
         apart = {"mass_kg": "object_mass_kg", "friction": "friction"}
@@ -253,7 +259,8 @@ class WorldConfig(FrozenModel):
         """Whether its reflection in y is the same world, so that what is learned on one side holds on the other."""
         as_they_are, reflected = ({each.placed(side) for each in self.fixtures} for side in (1, -1))
         base_y_m = 0.0 if isinstance(self.robot, str) else self.robot.base_position_m[1]
-        return self.workspace.center_y_m == 0.0 and base_y_m == 0.0 and as_they_are == reflected
+        meshes = any(each.shape == "mesh" for each in (*self.bodies, *self.obstacles))  # none is its own reflection
+        return self.workspace.center_y_m == base_y_m == 0.0 and as_they_are == reflected and not meshes
 
     @property
     def num_kept_commands(self) -> int:
@@ -266,16 +273,16 @@ class WorldConfig(FrozenModel):
         found = []
         for given, color in zip(self.objects or (self.object,), COLORS, strict=False):
             shape = simple_object(given, self.object_size_m) if isinstance(given, str) else given
-            if not isinstance(shape, ObstacleConfig):  # named, or the one object, whose mass and friction stand apart
-                shape = ObstacleConfig.model_construct(
-                    shape=shape.shape,
-                    size_m=shape.size_m,
-                    mesh=shape.mesh,
-                    color=color if isinstance(given, str) else shape.color,
-                    mass_kg=self.object_mass_kg,
-                    friction=self.friction,
-                )
-            found.append(shape)
+            own_mass_kg, own_friction = (getattr(shape, name, None) for name in ("mass_kg", "friction"))
+            body = ObstacleConfig.model_construct(
+                shape=shape.shape,
+                size_m=shape.size_m,
+                mesh=shape.mesh,
+                color=color if isinstance(given, str) else shape.color,
+                mass_kg=self.object_mass_kg if own_mass_kg is None else own_mass_kg,
+                friction=self.friction if own_friction is None else own_friction,
+            )
+            found.append(body)
         return tuple(found)
 
     @property

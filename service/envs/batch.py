@@ -145,6 +145,13 @@ class WorldBatch:
         return places_at(self.states, self._obstacles)
 
     @property
+    def blocked(self) -> BoolArray:
+        """(N,) whether a world's gripper stays closed."""
+        told = np.any(self.states[:, self.layout["gripper_blocked"]] > 0.0, axis=1)
+        found: BoolArray = np.logical_or(told, self.config.gripper == "blocked")
+        return found
+
+    @property
     def places(self) -> Places:
         """Where the things are that start elsewhere in every game."""
         return Places(self.object_position, self.box_place, self.obstacle_positions)

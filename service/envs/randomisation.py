@@ -71,7 +71,9 @@ def _variant(config: WorldConfig, drawn: dict[str, float]) -> WorldConfig:
     alike, factor = {same[name]: value for name, value in changed.items()}, drawn.get("object_size", 1.0)
     given = config.objects or (config.object,)
     bodies = tuple(
-        _scaled(body, factor).model_copy(update=alike if isinstance(each, str) or not config.objects else {})
+        _scaled(body, factor).model_copy(
+            update={key: value for key, value in alike.items() if getattr(each, key, None) is None}
+        )
         for each, body in zip(given, config.bodies, strict=True)  # a description keeps its own mass and friction
     )
     if config.objects:

@@ -124,7 +124,8 @@ class TaskGenerator:
             summary.proposed, summary.reached, summary.tries, summary.successes, summary.arranged
         )
         self.difficulty.record(summary.task_tries, summary.task_successes)
-        self.buffer.add(**summary.goals)
+        if self._config.generator.goal_source == "alice":  # no other source draws from it
+            self.buffer.add(**summary.goals)
         self._stop.record(num_new_cells, int(summary.task_tries.sum()), int(summary.task_successes.sum()))
         metrics = {
             **means(summary.metrics),

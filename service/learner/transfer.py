@@ -22,7 +22,8 @@ def take_over(
     """Copy the parameters of a trained network of another layout, if all of them fit, or else none.
 
     An input that both layouts have keeps its weights and its normalisation. A new one gets weights of 0, so that the
-    network computes what it did, and learns what it is good for.
+    network computes what it did, and learns what it is good for. Bounds of the std and of weights are those of the new
+    network's configuration.
 
     Args:
         network: that is new.
@@ -45,12 +46,12 @@ def take_over(
                 f"not taken, its inputs are {', '.join(new.columns)}, those of the trained one {', '.join(old.columns)}"
             )
     own = network.state_dict()
-    constants = {name for name, _ in network.named_buffers()}  # of the layout; a learner's state has none
+    constants = {name for name, _ in network.named_buffers()}  # a learner's state has none
     if missing := sorted((own.keys() ^ given.keys()) - constants):
         return f"not taken, {len(missing)} parameters are not in both, such as {missing[0]}"
     fitted = {}
     for name, tensor in own.items():
-        if name not in given or name.endswith("by_object"):  # columns of the layout
+        if name not in given or name.endswith("by_object") or not tensor.dim():  # of the layout, or the configuration
             continue
         array = torch.from_numpy(np.array(given[name], dtype=np.float32))
         if array.shape != tensor.shape:

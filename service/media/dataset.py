@@ -51,10 +51,11 @@ def played_episodes(recorded: RecordedEpisodes) -> list[Played]:
 
 
 def played_turns(rounds: Sequence[RecordedRound]) -> list[Played]:
-    """Alice's turns, each with where she left the object as its goal, and Bob's turns, where he had one."""
+    """Alice's turns, each with where she left the object as its goal, and Bob's turns; without those of no step."""
     turns = []
     for each in rounds:
-        turns.append(Played(each.alice_states, each.alice_actions, each.goal, is_alice=True))
+        if len(each.alice_actions):
+            turns.append(Played(each.alice_states, each.alice_actions, each.goal, is_alice=True))
         if len(each.bob_actions):
             turns.append(Played(each.bob_states, each.bob_actions, each.goal))
     return turns

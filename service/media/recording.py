@@ -41,7 +41,10 @@ _Interest = tuple[bool, bool, float]
 
 @dataclass(frozen=True, slots=True)
 class RecordedRound:
-    """One round in one world: Alice's turn, and Bob's from the same start. Without a valid goal he has no turn."""
+    """One round in one world: Alice's turn, and Bob's from the same start. Without a valid goal he has no turn.
+
+    Where Alice does not play, her turn has no step.
+    """
 
     alice_states: StateArray
     """(T1 + 1, S) from the start to where she left the object; rows of ``WorldBatch.states``."""
@@ -190,14 +193,20 @@ def _play(
     config: SelfPlayConfig, alice: StochasticPolicy, bob: DeterministicPolicy, *, num_worlds: int, seed: int
 ) -> Iterator[tuple[GoalRecords, list[RecordedRound]]]:
     """Rounds of that many worlds at once, each from a fresh reset, without end."""
-    rng = np.random.default_rng(seed)
-    config = config.model_copy(update={"game": config.game.model_copy(update={"num_worlds": num_worlds})})
+    rng, game, generator = np.random.default_rng(seed), {"num_worlds": num_worlds}, dict[str, object]()
+    if config.game.alice_plays:  # or else there are no goals but those of another source
+        generator = {"goal_source": "alice", "replay_fraction": 0.0, "replay_invalid": False}
+    config = config.model_copy(
+        update={
+            "game": config.game.model_copy(update=game),
+            "generator": config.generator.model_copy(update=generator),
+        }
+    )
     players = Players(version=0, alice=alice, bob=_WithoutNoise(bob))
     with contextlib.closing(SelfPlay(config, rng, num_threads=config.run.num_threads)) as self_play:
         if config.game.blocked_gripper_min_success > 0.0:  # by now he has come to it
             self_play.block_grippers(1.0)
             self_play.start_over()
-        # It was never told of a goal, so it replays none: Bob plays those of this round's Alice.
         snapshot = TaskGenerator(config, self_play.worlds.layout).snapshot()
         while True:
             yield _record(self_play, players, snapshot, rng)
@@ -234,7 +243,9 @@ def _record(
     states: list[StateArray] = []
     rollout = self_play.play_round(players, plan, snapshot, observe=lambda now: states.append(now.copy()))
     records, alice_steps = rollout.records, int(rollout.alice.active.any(axis=1).sum())
-    alice_states, bob_states = np.stack(states[: alice_steps + 1]), np.stack(states[alice_steps + 1 :])
+    num_hers = alice_steps + 1 if alice_steps else 0  # a turn that is left out has no start of its own
+    bob_states = np.stack(states[num_hers:])
+    alice_states = np.stack(states[:num_hers] or states[:1])
     return records, [
         RecordedRound(
             alice_states=alice_states[:, world],

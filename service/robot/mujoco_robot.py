@@ -35,7 +35,7 @@ class MujocoParameters(FrozenModel):
     )
     joint_friction_nm: float = Field(0.0, ge=0.0, le=20.0, description="dry friction of the arm's joints")
     object_mass_kg: float | None = Field(
-        None, gt=0.0, le=5.0, description="mass; of several objects only of those that are named"
+        None, gt=0.0, le=5.0, description="mass; of several objects of those that have none of their own"
     )
     object_size_m: float | None = Field(None, ge=0.02, le=0.07, description="edge or diameter, of one object")
     friction: float | None = Field(None, gt=0.0, le=3.0)

@@ -95,6 +95,18 @@ def test_what_is_held_counts_once_all_others_are_there(blue_is_there):
     assert {step: reward for step, reward in enumerate(paid) if reward} == changes
 
 
+@pytest.mark.parametrize("blocked", [True, False])
+def test_a_gripper_that_is_blocked_holds_nothing(monkeypatch, blocked):
+    """Closed fingers may both touch what they push."""
+    game, red_alone = make_game(blocked_gripper_fraction=0.5), np.array([[*RED, *RED]])
+    states = game.worlds.states.copy()
+    states[:, game.worlds.layout["gripper_blocked"]] = blocked
+    game.worlds.restore(states)
+    monkeypatch.setattr(game.worlds, "contacts", lambda: np.array([[True, True, False, False]]))
+    assert game._at_goals(red_alone, 0.05).tolist() == [[blocked, False]]
+    assert game._at_goals(np.array([[*RED, *BLUE]]), 0.05).tolist() == [[True, True]]
+
+
 def test_a_turn_has_time_for_each_object_that_has_to_be_moved():
     far = (0.1, 0.15, 0.025)
     game = make_game(3, bob_hold_steps=20)

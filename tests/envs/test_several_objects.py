@@ -58,6 +58,8 @@ def test_what_is_named_has_the_worlds_size_mass_and_friction_and_a_color_of_its_
     assert [(each.mass_kg, each.friction) for each in world.bodies] == [(0.3, 0.5), (0.3, 0.5), (0.3, 0.8)]
     assert [each.color for each in world.bodies] == [each.color for each in WorldConfig(objects=["cube"] * 3).bodies]
     assert WorldConfig.model_validate(world.model_dump()) == world
+    harder = WorldConfig.model_validate(world.model_dump() | {"object_mass_kg": 1.0, "friction": 0.25})  # as of a task
+    assert [(each.mass_kg, each.friction) for each in harder.bodies] == [(1.0, 0.25), (1.0, 0.25), (1.0, 0.8)]
 
 
 @pytest.mark.parametrize("config", [CUBES, MIXED, WorldConfig(objects=("cube", "cube", CYLINDER), **FAST)])

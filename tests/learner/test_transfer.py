@@ -55,6 +55,18 @@ def test_it_computes_what_the_trained_one_did(name, before, after):
     torch.testing.assert_close(outputs(new, wider), outputs(trained, rows))
 
 
+def test_bounds_are_those_of_the_configuration():
+    """A resumed run has them from there, too."""
+    bounds = {"log_std_min": -1.2, "log_std_max": 0.3, "weight_floor": 0.05}
+    trained = networks.make_bob(SMALL, PAPER)
+    new = networks.make_bob(SMALL.model_copy(update={"bob": SMALL.bob.model_copy(update=bounds)}), PAPER)
+    own = {name: tensor.clone() for name, tensor in new.named_buffers() if not tensor.dim()}
+    assert sorted(each.item() for each in own.values()) == pytest.approx(sorted(bounds.values()))
+    assert take_over(new, networks.export_parameters(trained), PAPER, PAPER, BOB_INPUTS) == "taken"
+    assert {name: new.get_buffer(name).item() for name in own} == {name: each.item() for name, each in own.items()}
+    assert all(torch.equal(tensor, new.get_parameter(name)) for name, tensor in trained.named_parameters())
+
+
 def test_policies_of_two_objects():
     two, wider = (Layouts(num_commands=num, num_objects=2, alike=(0, 1)) for num in (0, 2))
     torch.manual_seed(0)

@@ -13,6 +13,7 @@ from service.config.skills import SkillsConfig
 from service.envs.batch import WorldBatch
 from service.generator.validity import Verdict
 from service.media import recording, video
+from service.media.dataset import played_turns
 from service.media.recording import record_episodes, record_rounds, record_skills
 from service.policies.frozen_skills import FrozenSkills
 from tests.methods.skill_sets import parameters
@@ -65,6 +66,27 @@ def test_recorded_rounds_are_rounds():
         assert reached(played).tolist() == [False] * (len(played.bob_states) - 1) + [True]
     moved = [np.linalg.norm(played.goal - played.alice_states[0, OBJECT]) for played in rounds]
     assert moved == sorted(moved, reverse=True)
+
+
+def test_bob_plays_alices_goals_whatever_the_source_of_others():
+    sources = {"goal_source": "uniform", "replay_invalid": True, "replay_fraction": 1.0}
+    config = SelfPlayConfig(game={"alice_steps": 4, "bob_steps": 4}, generator=sources)
+    for played in recording.play_rounds(config, Constant(NOTHING), Constant(NOTHING), num_rounds=4, seed=0):
+        np.testing.assert_array_equal(played.alice_states[-1, OBJECT], played.goal)
+        assert (played.verdict, len(played.bob_actions)) == (Verdict.NOT_MOVED, 0)
+
+
+def test_rounds_without_alice_begin_with_bob():
+    config = SelfPlayConfig(
+        game={"alice_plays": False, "bob_steps": 4},
+        generator={"goal_source": "uniform", "replay_invalid": True},
+    )
+    for played in recording.play_rounds(config, Constant(NOTHING), Constant(PUSH), num_rounds=4, seed=0):
+        assert (len(played.alice_states), len(played.alice_actions)) == (1, 0)
+        np.testing.assert_array_equal(played.alice_states[0], played.bob_states[0])
+        assert played.bob_states[0, 0] == 0.0  # the time
+        assert len(played.bob_states) == len(played.bob_actions) + 1 > 1
+        assert [turn.is_alice for turn in played_turns([played])] == [False]
 
 
 def test_the_actions_lead_from_state_to_state():

@@ -20,4 +20,6 @@ def test_intervals_by_hand():
     assert seed_interval([0.5, 0.5]) == (0.5, 0.5)
     # four: Student's t of three degrees of freedom is 3.182, the standard error 0.11547 / 2
     assert seed_interval([0.4, 0.6] * 2) == pytest.approx((0.5 - 3.182 * 0.057735, 0.5 + 3.182 * 0.057735), abs=1e-5)
-    assert seed_interval([0.0, 1.0] * 8) == pytest.approx((0.5 - 1.96 * 0.516398 / 4, 0.5 + 1.96 * 0.516398 / 4))
+    assert seed_interval([0.0, 1.0] * 8) == pytest.approx((0.5 - 2.131 * 0.516398 / 4, 0.5 + 2.131 * 0.516398 / 4))
+    half = 1.96 * (36 / 35 / 4) ** 0.5 / 6  # near enough from 31 degrees of freedom on
+    assert seed_interval([0.0, 1.0] * 18) == pytest.approx((0.5 - half, 0.5 + half))
