@@ -50,11 +50,11 @@ def named(what: str | None, method: str | None, primitives: str | None) -> tuple
             raise TandemError(f"--method {method} is for a task: name one, such as tandem train push")
         return recipe, [f"method={method}"] if method is not None and recipe is None else []
     if what not in known and not Path(what).suffix and not Path(what).exists():
-        raise TandemError(
-            f"{what!r}: no recipe, task or file of that name; there are {', '.join(known)}{did_you_mean(what, known)}"
-        )
+        files = [str(file) for ending in (".py", ".yaml") if (file := Path(f"{what}{ending}")).is_file()]
+        meant = f"; did you mean {' or '.join(files)}?" if files else did_you_mean(what, known)
+        raise TandemError(f"{what!r}: no recipe, task or file of that name; there are {', '.join(known)}{meant}")
     if method is not None:
-        raise TandemError(f"{what} says its method itself: leave out --method, or change it by --set method={method}")
+        raise TandemError(f"{what} says its method itself: leave out --method, or leave out {what}")
     return recipes().get(what, Path(what)), []
 
 

@@ -103,6 +103,10 @@ def evaluate(
         from service.methods.task_evaluation import FINAL_SEED, numbers_of
         from service.registry.loading import load
 
+        if goals is not None and "," in goals:
+            raise TandemError(
+                f"--goals {goals!r}: evaluate takes a kind, {', '.join(GOAL_KINDS)}; points are for render"
+            )
         asked = None if goals is None else choose("--goals", goals, GOAL_KINDS)
         trained = load(reference, registry, primitives, run_task_code=run_task_code).on(task)
     players, on = _players(trained, method), trained.task

@@ -207,7 +207,7 @@ def _connected(
 
     A simulator and a dry run ask no question, and no key has to be held: they endanger no person.
     """
-    from service.robot.backends import connect
+    from service.robot.backends import connect, naming_errors
     from service.robot.safety import always_held
     from service.robot.watchdogs import HeldKey
 
@@ -228,7 +228,8 @@ def _connected(
                 if not sys.stdin.readline():
                     raise TandemError("standard input has ended, so nobody can press Enter: run this in a terminal")
 
-        yield backend, key or always_held, wait
+        with naming_errors(described):
+            yield backend, key or always_held, wait
 
 
 def _print_step(row: dict[str, Any], box: Box, *, to_stderr: bool) -> None:

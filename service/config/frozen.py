@@ -25,11 +25,27 @@ class FrozenModel(BaseModel):
         return value
 
 
+_WANTED = {
+    "tuple_type": "give a list, such as [A, B]",
+    "model_type": "give a group of keys, such as {KEY: VALUE}",
+    "model_attributes_type": "give a group of keys, such as {KEY: VALUE}",
+    "dict_type": "give a group of keys, such as {KEY: VALUE}",
+}
+"""What to do about the types of errors whose own words are Python's."""
+
+
+def first_of(error: ValidationError) -> Any:
+    """What is wrong first: a key that is unknown, which may be another one misspelt, before one that is missing."""
+    errors = error.errors()
+    return next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
+
+
 def first_error(error: ValidationError) -> str:
     """The first thing that is wrong with plain values, in a few words."""
-    first = error.errors()[0]
+    first = first_of(error)
     key = ".".join(str(part) for part in first["loc"] if part not in NO_KEYS) or "the top level"
     if first["type"] == "extra_forbidden":
         return f"unknown key {key!r}"
     found = "" if isinstance(first["input"], dict) else f" = {first['input']!r}"  # a whole group says nothing
-    return f"{key}{found}: {first['msg'].removeprefix('Value error, ')}"  # which our own checks have
+    words = _WANTED.get(first["type"], first["msg"].removeprefix("Value error, "))  # which our own checks have
+    return f"{key}{found}: {words}"

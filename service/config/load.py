@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -13,7 +14,7 @@ from service.base.errors import ConfigError, did_you_mean
 from service.base.parsing import EXPONENT
 from service.base.user_code import recorded
 from service.config.find import METHODS, find_class
-from service.config.frozen import NO_KEYS, first_error
+from service.config.frozen import NO_KEYS, first_error, first_of
 from service.config.run import Config
 from service.config.tree import apply_override, read_yaml
 
@@ -24,7 +25,7 @@ def load_config(
     """Read a run's configuration.
 
     Args:
-        path: YAML file; None for the defaults.
+        path: YAML file; None for the defaults. One without a ``name`` has that of the file.
         overrides: ``a.b=c`` strings, applied in order; the value is parsed as YAML.
         code: texts that a run has recorded, which stand for those that the files of a user's have now.
 
@@ -32,6 +33,8 @@ def load_config(
         ConfigError: file missing or not YAML, unknown key, value out of range; one line a user can act on.
     """
     tree = read_yaml(Path(path)) if path is not None else {}
+    if path is not None and not tree.keys() & {"name", "task"}:  # or else it is published as one of ours
+        tree |= {"name": name} if (name := re.sub(r"[^a-z0-9]+", "-", Path(path).stem.lower()).strip("-")[:64]) else {}
     for override in overrides:
         apply_override(tree, override)
     if code:
@@ -71,7 +74,7 @@ def parse_config(tree: dict[str, Any], *, where: str) -> Config:
 
 def explained(error: ValidationError, kind: type[BaseModel]) -> str:
     """The first thing that is wrong with the tree of a model; of an unknown key, too, which are known there."""
-    first = error.errors()[0]
+    first = first_of(error)
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     if first["type"] == "extra_forbidden":
         *groups, name = (part for part in first["loc"] if isinstance(part, str) and part not in NO_KEYS)

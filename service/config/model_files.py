@@ -41,7 +41,10 @@ def model_file(name: str, sha256: str | None = None) -> Path:
         package, _, rest = name.removeprefix(PACKAGE).partition("/")
         found = find_spec(package) if package.isidentifier() else None
         if found is None or not found.submodule_search_locations:
-            raise ConfigError(f"model {name}: no Python package {package!r} is installed here")
+            raise ConfigError(
+                f"model {name}: no Python package {package!r} is installed here; tandem configs says how to install "
+                "what its robots need"
+            )
         path = Path(found.submodule_search_locations[0]) / rest
     if sha256 is not None and (digest := file_digest(name)) != sha256:
         raise ConfigError(

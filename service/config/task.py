@@ -108,8 +108,8 @@ class TaskConfig(Config):
         starts, episodes = self.sac.learning_starts, self.episode_steps * self.sac.num_worlds
         if self.run.total_env_steps <= starts:
             raise ValueError(
-                f"{self.run.total_env_steps} env steps are all uniform actions: give more than sac.learning_starts, "
-                f"{starts}"
+                f"run.total_env_steps = {self.run.total_env_steps} has to be more than sac.learning_starts, {starts}: "
+                "so many env steps have random actions, and nothing is learned"
             )
         length_known = parse_reference(self.task) is None or bool(self.code)
         if length_known and self.hold_steps > self.episode_steps:

@@ -110,6 +110,12 @@ def _find(robot: RobotConfig, arm: Chain) -> Reach:
     joints = arm.solve(np.tile(arm.home, (_NUM_HEIGHTS, 1)), above_home, num_iterations=50)
     first, last = _run(_arrives(arm, joints, above_home), int(np.argmin(np.abs(heights - home[2]))))
     if first == last:
+        for name, value, low, high in zip(robot.joints, arm.home, arm.lower, arm.upper, strict=True):
+            if not low <= value <= high:
+                raise ConfigError(
+                    f"robot {robot.name}: home of {name!r} is {value:g}, and the joint goes from {low:.2f} to "
+                    f"{high:.2f}: give rad, or metres of one that slides"
+                )
         raise ConfigError(
             f"robot {robot.name}: from its home posture the arm does not come to ({in_metres(home)}) m with the "
             f"orientation {robot.orientation!r}: check home, effector and orientation"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.base.errors import ConfigError
+from service.base.errors import ConfigError, in_metres
 from service.base.types import Array, BoolArray, StateArray
 from service.base.user_code import CodeError, checked, naming_errors_of, place_of, shown
 from service.config.run import SUCCESS_DISTANCE_M
@@ -118,8 +118,11 @@ class Rules:
                 wrong |= inside_gripper_or_table(place, config, batch.gripper_at_start, rest_m)
             if not wrong.any():
                 return place
-        where = place_of(getattr(self.task, name))[1]
-        raise CodeError(f"{where}: {name} gave no place that is within reach and clear: choose others")
+        where, one = place_of(getattr(self.task, name))[1], each_object(place[wrong][:1])[0]
+        raise CodeError(
+            f"{where}: {name} gave no place that is within reach and clear, in {wrong.sum()} of {len(wrong)} worlds, "
+            f"{_MAX_DRAWS} times: at last {' and '.join(f'({in_metres(each)})' for each in one)} m; choose others"
+        )
 
     def advance(self, goal: StateArray) -> None:
         """Count a step that was made, and update the memory."""

@@ -67,8 +67,8 @@ class CheckedSource:
         self, config: SelfPlayConfig, coverage: float, success_rate: float, near: Callable[[StateArray], BoolArray]
     ) -> None:
         kind: type[GoalSource] = find_class(config.generator.goal_source, config.code, GoalSource)
-        self._known = Known(config.world, config.success_distance_m, coverage, success_rate, near)
-        self._origin, self._name = getfile(kind), kind.__name__
+        self._origin, self._name, self._near = getfile(kind), kind.__name__, near
+        self._known = Known(config.world, config.success_distance_m, coverage, success_rate, self._asked_near)
         with naming_errors_of(self._origin):
             self._source = kind()
 
@@ -80,6 +80,13 @@ class CheckedSource:
         goal = checked(f"{self._origin}: {self._name}.goals", goal, shape)
         kept: StateArray = goal[in_workspace(goal, self._known.world.workspace).all(axis=1)].reshape(-1, shape[1] * 3)
         return kept[~inside_each_other(kept, self._known.world)]
+
+    def _asked_near(self, goal: StateArray) -> BoolArray:
+        """``Known.near``, of (M, 3 K) or (M, K, 3) goals."""
+        num, rows = self._known.world.num_objects, np.asarray(goal, dtype=np.float64)
+        if rows.shape[1:] not in ((3 * num,), (num, 3)):
+            raise CodeError(f"{self._origin}: known.near: goal has shape {rows.shape}; give (M, {num}, 3)")
+        return self._near(rows.reshape(len(rows), 3 * num))
 
     def weights(self, goal: StateArray, start: StateArray, learnability: StateArray) -> StateArray:
         """(M,) weights of tasks with (M, 3 K) goals and starts."""

@@ -148,8 +148,10 @@ def check_reward(config: SkillsConfig, code: Mapping[str, str]) -> IntrinsicRewa
     origin = getfile(kind)
     random = torch.Generator().manual_seed(0)
     before, after, skill = (torch.randn(8, size, generator=random) for size in (STATE_SIZE, STATE_SIZE, config.size))
+    where = f"{origin}: {kind.__name__}"
     with naming_errors_of(origin):
         reward, again = (kind(config, STATE_SIZE, seed) for seed in (0, 1))
+        _check_tensors(where, reward.rewards(before, after, skill), reward.loss(before, after, skill), config, kind)
         loss, paid = reward.learn(before, after, skill), reward.rewards(before, after, skill).numpy()
         again.load_state(reward.state())
         resumes = again.learn(before, after, skill) == reward.learn(before, after, skill)
@@ -157,7 +159,6 @@ def check_reward(config: SkillsConfig, code: Mapping[str, str]) -> IntrinsicRewa
         rows = torch.randn(8, len(layers[0][0]) if layers else STATE_SIZE, generator=random)
         with torch.no_grad():
             found = reward.network(rows).numpy()
-    where = f"{origin}: {kind.__name__}"
     checked(f"{where}.paid", paid, (8, config.size) if reward.pays_features else (8,))
     checked(f"{where}.loss", np.array(loss), ())
     if not resumes:
@@ -171,6 +172,21 @@ def check_reward(config: SkillsConfig, code: Mapping[str, str]) -> IntrinsicRewa
             "or set zero_shot = 'none'"
         )
     return reward
+
+
+def _check_tensors(where: str, paid: object, loss: object, config: SkillsConfig, kind: type[IntrinsicReward]) -> None:
+    """Check what torch would only say in words of its own."""
+    for name, given in (("paid", paid), ("loss", loss)):
+        if not isinstance(given, torch.Tensor):
+            raise CodeError(f"{where}.{name} gave a {type(given).__name__}; give a torch.Tensor")
+    assert isinstance(paid, torch.Tensor)
+    assert isinstance(loss, torch.Tensor)
+    if loss.dim():
+        raise CodeError(f"{where}.loss gave shape {list(loss.shape)}; give one number, such as its mean()")
+    if not loss.requires_grad:
+        raise CodeError(f"{where}.loss does not depend on the network that it is to teach: use self.network in it")
+    if paid.shape == (len(paid), config.size) and not kind.pays_features:
+        raise CodeError(f"{where}.paid gave shape {list(paid.shape)}; give [{len(paid)}], or set pays_features = True")
 
 
 def make(config: SkillDiscoveryConfig, registry: Path | str, start_from: Trained | None) -> SkillDiscovery:

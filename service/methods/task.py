@@ -265,6 +265,9 @@ def begin(config: TaskConfig, registry: Path | str, start_from: Trained | None) 
             "code": recorded(config.task, config.code),
         }
     )
+    for key in ("episode_steps", "task_version", "task_world"):
+        if key in config.model_fields_set and getattr(config, key) != (said := getattr(exact, key)):
+            raise ConfigError(f"{key} = {getattr(config, key)!r}: the task {config.task} says {said!r}; leave it out")
     if task.code:  # another length of an episode, with which settings may not go
         try:
             TaskConfig.model_validate(exact.model_dump(mode="json"))

@@ -229,7 +229,9 @@ class Trained:
         world, known = task.world_from(self.config.world), self.config.world
         if (num := world.num_objects) != known.num_objects:
             of = f"a world of {known.num_objects} object{'s' * (known.num_objects > 1)}"
-            raise TandemError(f"{self.label} was trained in {of}, and {task.title} has {num}: name what fits there")
+            raise TandemError(
+                f"{self.label} was trained in {of}, and {task.title} has {num}: name what fits there, by --primitives"
+            )
         if (there := layouts(world).positions.size) != (seen := layouts(known).positions.size):
             raise TandemError(
                 f"{self.label} sees {seen} positions, and in the world of {task.title} there are {there}: leave "

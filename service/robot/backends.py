@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import inspect
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -11,7 +15,9 @@ from pydantic import Field, ValidationError
 
 from service.base.errors import TandemError, did_you_mean, one_line
 from service.base.types import StateArray
+from service.base.user_code import naming_errors_of
 from service.config.frozen import FrozenModel, first_error
+from service.config.load import explained
 from service.config.tree import read_yaml
 from service.config.world import WorldConfig
 from service.robot.disturbed import DisturbanceConfig, DisturbedPoses, DisturbedRobot
@@ -110,7 +116,22 @@ def read_backend(reference: str) -> BackendConfig:
     try:
         return BackendConfig.model_validate(read_yaml(Path(reference)))
     except ValidationError as error:
-        raise TandemError(f"robot {reference}: {first_error(error)}") from None
+        raise TandemError(f"robot {reference}: {explained(error, BackendConfig)}") from None
+
+
+@contextmanager
+def naming_errors(config: BackendConfig) -> Iterator[None]:
+    """Say of an unexpected error of a user's back-end where in its file it comes from."""
+    try:
+        yield
+    except (TandemError, OSError):
+        raise
+    except Exception:
+        module = sys.modules.get(config.backend.partition(":")[0])
+        if config.backend in BACKENDS or module is None or module.__file__ is None:
+            raise
+        with naming_errors_of(module.__file__):
+            raise
 
 
 def connect(config: BackendConfig, world: WorldConfig, *, seed: int = 0) -> Backend:
@@ -125,6 +146,8 @@ def connect(config: BackendConfig, world: WorldConfig, *, seed: int = 0) -> Back
         TandemError: no such back-end, what it needs is not installed, or it does not answer.
     """
     module, _, name = BACKENDS.get(config.backend, config.backend).partition(":")
+    if module.endswith(".py"):
+        raise TandemError(f"robot {config.backend!r}: write it as Python imports it, {Path(module).stem}:{name}")
     try:
         made = getattr(importlib.import_module(module), name)(world, config.parameters)
     except ValidationError as error:
@@ -138,6 +161,13 @@ def connect(config: BackendConfig, world: WorldConfig, *, seed: int = 0) -> Back
         raise TandemError(
             f"robot {config.backend!r} made {type(made).__name__}; return a service.robot.backends.Backend"
         )
+    for part, kind in ((made.robot, RobotInterface), (made.poses, PoseSource)):
+        methods = [name for name, each in vars(kind).items() if inspect.isfunction(each) and not name.startswith("_")]
+        if missing := [name for name in methods if not callable(getattr(part, name, None))]:
+            raise TandemError(
+                f"robot {config.backend!r}: {type(part).__name__} has no {', '.join(missing)}, which "
+                f"service.robot.interface.{kind.__name__} asks for"
+            )
     if config.disturbance == DisturbanceConfig():
         return made
     poses = DisturbedPoses(made.poses, made.robot.now_s, config.disturbance, num_objects=world.num_objects, seed=seed)

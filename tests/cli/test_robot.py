@@ -131,6 +131,31 @@ def test_what_cannot_be_run_is_one_line(arguments, said):
     assert_refused(invoke("run", *arguments), said)
 
 
+ARM = """
+from service.robot.backends import Backend
+
+class Arm:
+    def read(self):
+        return self.finger
+
+    def close(self): ...
+
+def connect(world, parameters):
+    return Backend(Arm(), Arm())
+"""
+REST = "def now_s(self): return 0.0\n    command = wait_until = stop = close"
+
+
+def test_what_is_wrong_in_a_back_end_of_a_users_is_said_with_its_line(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "half_an_arm.py").write_text(ARM)
+    words = "'half_an_arm:connect': Arm has no now_s, command, wait_until, stop, which service.robot.interface.RobotInt"
+    assert_refused(invoke("run", "--robot", "half_an_arm:connect", "--dry-run"), words)
+    (tmp_path / "an_arm.py").write_text(ARM.replace("def close", f"{REST} = lambda *_: None\n    def close"))
+    said = "an_arm.py:6: AttributeError: 'Arm' object has no attribute 'finger'"
+    assert_refused(invoke("run", "--robot", "an_arm:connect", "--dry-run"), said)
+
+
 def test_a_goal_inside_the_wall_is_refused_and_one_behind_it_is_not():
     wall = WorldConfig(fixture="wall")
     with pytest.raises(TandemError, match=r"^--goal: at -0\.050, 0\.000, 0\.025 an object would be inside a fixture"):

@@ -62,6 +62,7 @@ def test_goals_are_its_own_and_in_the_workspace(file):
             "[1.05, 0.05, 0.025], [1.3",
             "it gives no goal in the workspace while nothing is known",
         ),
+        ("goal[:, 0])]", "goal[:, None])]", "corner.py: known.near: goal has shape ("),
         ("known.near(", "known.far(", "corner.py:8: AttributeError: "),
         ("(learnability > 0.0)", "np.nan", "Corner.weights gave nan at [0] of shape ("),
         ("(learnability > 0.0)", "-learnability", "Corner.weights gave numbers below 0"),

@@ -85,7 +85,11 @@ def test_it_goes_the_way_of_ours(file, tmp_path):
     ("old", "new", "said"),
     [
         ("dim=1).mean()", "dim=7).mean()", "upwards.py:10: IndexError: "),
-        ("pays_features = True", "pays_features = False", "Upwards.paid gave float32 of shape (8, 3); give float"),
+        ("pays_features = True", "pays_features = False", "Upwards.paid gave shape [8, 3]; give [8], or set pays"),
+        ("dim=1).mean() +", "dim=1) +", "Upwards.loss gave shape [8]; give one number, such as its mean()"),
+        ("return -(self", "return 0.0; -(self", "Upwards.loss gave a float; give a torch.Tensor"),
+        ("return -(self", "return after.mean(); -(self", "Upwards.loss does not depend on the network that it is to"),
+        ("self.network(before)\n", "self.network(before).numpy()\n", "RuntimeError: Can't call numpy() on Tensor"),
         ("- self.network(before)", "/ 0.0", "Upwards.paid gave nan at [0, 0] of shape (8, 3)"),
         ("class Upwards(IntrinsicReward)", "class Upwards", "upwards.py:Upwards: no class that derives from Intrin"),
         ("IntrinsicReward\n\nclass", "Gone\n\nclass", "upwards.py:2: ImportError: "),

@@ -316,7 +316,7 @@ def test_a_manifest_that_lacks_what_an_orchestrator_needs(tmp_path):
         ({"method": "ourss"}, r"method = 'ourss': choose one of .*ours-her.*; did you mean 'ours"),
         (
             {"run": {"total_env_steps": 200}},
-            "200 env steps are all uniform actions: give more than sac.l",
+            "run.total_env_steps = 200 has to be more than sac.learning_starts, ",
         ),
         (
             {"method": "ours-her", "sac": {"learning_starts": 199}},

@@ -101,6 +101,7 @@ def test_back_ends_by_name_file_and_function(tmp_path):
         ("backend: mujoco\ndisturbance: {pose_delay_s: -1}\n", r"disturbance.pose_delay_s = -1: .*greater than"),
         ("backend: mujoco\nparameters: {friction: high}\n", "robot mujoco: parameters: friction = 'high'"),
         ("backend: nowhere:at_all\n", "robot 'nowhere:at_all' cannot be made: .* No module named 'nowhere'"),
+        ("backend: my_arm.py:connect\n", "write it as Python imports it, my_arm:connect"),
         ("backend: os:getcwd\n", "robot 'os:getcwd' cannot be made: TypeError: "),
         ("backend: operator:eq\n", "robot 'operator:eq' made bool; return a "),
     ],
