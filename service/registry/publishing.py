@@ -80,7 +80,7 @@ def publish_run(
     version = next((each for each in candidates if _has(registry, each, parameters)), None)
     if version is None:
         known = directory.history
-        history = known.model_dump(mode="json") if known is not None and known.events else None
+        history = known.model_dump(mode="json") if known.events else None
         version = publish(registry, config, parameters, metrics, parent=parent, history=history)
     elif (last := directory.read_published()) is None or last.version != str(version):
         registry.complete(version)  # whoever published it may have been cut off

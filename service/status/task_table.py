@@ -97,8 +97,9 @@ def _read(status: RunStatus, trial: Trial, path: Path) -> _Run:
     settings = _settings(config, config.stat().st_mtime_ns)
     result = RunDirectory(path).read_result()
     if result is not None:
-        goes_on = result["env_steps"] < status.total_env_steps  # it is of a shorter training
-        if goes_on or not {"success_last", "num_episodes"} <= result["evaluation"].keys():
+        # or else it may be of a shorter training, which goes on
+        is_last = status.state in ("finished", "converged") or result["env_steps"] >= status.total_env_steps
+        if not is_last or not {"success_last", "num_episodes"} <= result["evaluation"].keys():
             result = None
     ended = (path / RESULT_FILE).stat().st_mtime if result is not None else 0.0
     made = {} if result is None else result.get("made", {})

@@ -117,10 +117,14 @@ def test_of_a_seed_that_was_run_twice_the_newer_counts(root):
 def test_a_result_of_a_shorter_training_or_of_something_else_is_none(root):
     longer = write_trial(root, "a", "push", "ours", 0, 0.2, total_env_steps=4000)
     other = write_trial(root, "b", "push", "ours", 1, 0.4, total_env_steps=4000)
-    write_trial(root, "c", "push", "ours", 2, 0.6, total_env_steps=4000)
-    for path, changed in ((longer, {"env_steps": 3000}), (other, {"evaluation": {"coverage": 0.5}})):
-        result = json.loads((path / "result.json").read_text())
-        (path / "result.json").write_text(json.dumps(result | changed))
+    sooner = write_trial(root, "c", "push", "ours", 2, 0.6, total_env_steps=4000)  # it has converged
+    for path, file, changed in (
+        (longer, "result.json", {"env_steps": 3000}),
+        (longer, "status.json", {"state": "interrupted"}),
+        (other, "result.json", {"evaluation": {"coverage": 0.5}}),
+        (sooner, "result.json", {"env_steps": 3000}),
+    ):
+        (path / file).write_text(json.dumps(json.loads((path / file).read_text()) | changed))
     (cell,) = table(root).rows[0].cells
     assert (cell.success, cell.run_ids, cell.unfinished) == (0.6, ("c",), ("a", "b"))
 
