@@ -20,23 +20,27 @@ from service.config.tree import apply_override, read_yaml
 
 
 def load_config(
-    path: Path | str | None = None, overrides: Sequence[str] = (), code: Mapping[str, str] | None = None
+    path: Path | str | None = None,
+    overrides: Sequence[str] = (),
+    code: Mapping[str, str] | None = None,
+    name: str | None = None,
 ) -> Config:
     """Read a run's configuration.
 
     Args:
-        path: YAML file; None for the defaults. One without a ``name`` has that of the file.
+        path: YAML file; None for the defaults.
         overrides: ``a.b=c`` strings, applied in order; the value is parsed as YAML.
         code: texts that a run has recorded, which stand for those that the files of a user's have now.
+        name: of a file that says none, nor do the overrides; None: the file's own.
 
     Raises:
         ConfigError: file missing or not YAML, unknown key, value out of range; one line a user can act on.
     """
     tree = read_yaml(Path(path)) if path is not None else {}
-    if path is not None and not tree.keys() & {"name", "task"}:  # or else it is published as one of ours
-        tree |= {"name": name} if (name := re.sub(r"[^a-z0-9]+", "-", Path(path).stem.lower()).strip("-")[:64]) else {}
     for override in overrides:
         apply_override(tree, override)
+    if path is not None and not tree.keys() & {"name", "task"}:  # or else it is published as one of ours
+        tree["name"] = name or re.sub(r"[^a-z0-9]+", "-", Path(path).stem.lower()).strip("-")[:64] or "run"
     if code:
         tree.setdefault("code", dict(code))
     if path is None:
@@ -80,7 +84,7 @@ def explained(error: ValidationError, kind: type[BaseModel]) -> str:
         *groups, name = (part for part in first["loc"] if isinstance(part, str) and part not in NO_KEYS)
         prefix, keys = "".join(f"{group}." for group in groups), list(_keys(kind))
         known = sorted(name for before, name in keys if before == prefix)
-        more = f"; known there: {', '.join(known)}{more}{_elsewhere(keys, name) or did_you_mean(name, known)}"
+        more = f"; known there: {', '.join(known)}{more}{_elsewhere(keys, name, kind) or did_you_mean(name, known)}"
     return f"{first_error(error)}{more}"
 
 
@@ -121,11 +125,13 @@ def _keys(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str]]
             yield from _keys(group, f"{prefix}{name}.")
 
 
-def _elsewhere(keys: Sequence[tuple[str, str]], name: str) -> str:
+def _elsewhere(keys: Sequence[tuple[str, str]], name: str, kind: type[BaseModel]) -> str:
     """The end of a message about a key that is not in its group, where another group or method has it."""
     found = sorted(prefix + name for prefix, other in keys if other == name)
     if found:
         return f"; did you mean {' or '.join(found)}?"
+    if not issubclass(kind, Config):
+        return ""
     others: dict[type[Config], str] = {}  # one method of each class
     for method in METHODS:
         if name in (other := find_class(method, {})).model_fields:

@@ -136,7 +136,7 @@ Object = Annotated[
 OneOfSeveral = Annotated[
     Annotated[Literal["cube", "sphere"], Tag(NAMED)] | Annotated[OneOfSeveralConfig, Tag(DESCRIBED)],
     Discriminator(lambda value: NAMED if isinstance(value, str) else DESCRIBED),
-    BeforeValidator(_read_mesh),
+    BeforeValidator(lambda value: _read_mesh(value.model_dump() if isinstance(value, ObjectConfig) else value)),
 ]
 """The same; a description may have its own mass and friction."""
 Fixture = Annotated[FixtureConfig, BeforeValidator(_read_mesh)]

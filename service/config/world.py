@@ -201,11 +201,11 @@ class WorldConfig(FrozenModel):
             return {**rest, "objects": filled}
         (only,) = objects
         if isinstance(only, OneOfSeveralConfig):
-            only = only.model_dump(exclude_none=True)
+            only = only.model_dump()
         if not isinstance(only, Mapping):
             return {**rest, "object": only}
         apart = {"mass_kg": "object_mass_kg", "friction": "friction"}
-        given = {apart[key]: value for key, value in only.items() if key in apart}
+        given = {apart[key]: value for key, value in only.items() if key in apart and value is not None}
         return {**rest, **given, "object": {key: value for key, value in only.items() if key not in apart}}
 
     @model_validator(mode="after")

@@ -22,6 +22,7 @@ from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.gym.tabletop import FURTHEST_M, action_space, goal_space
 from service.envs.observations import distances
+from service.envs.scene import build_layout
 from service.media.recording import RecordedEpisodes, RecordedRound
 
 _NAME = re.compile(r"(?![\w-]/[\w-]+$)(?:[\w-]+/)*[\w-]+-v[0-9]+")  # what Minari takes
@@ -127,8 +128,8 @@ def _buffers(played: Sequence[Played], config: Config) -> Iterator[object]:
     from minari.data_collector import EpisodeBuffer
 
     longest = max(len(each.states) for each in played)
-    blocked = 0.0
-    if isinstance(config, SelfPlayConfig) and played[0].is_alice:  # states of self-play may have a column more
+    blocked, usual = 0.0, build_layout(config.world).size
+    if isinstance(config, SelfPlayConfig) and played[0].states.shape[1] > usual:  # of self-play, with a column more
         blocked = config.game.blocked_gripper_fraction
     with WorldBatch(config.world, longest, num_threads=1, blocked_fraction=blocked) as worlds:
         for each in track(played, "writing the data set", len(played), "episodes"):

@@ -185,7 +185,7 @@ def _check_tensors(where: str, paid: object, loss: object, config: SkillsConfig,
         raise CodeError(f"{where}.loss gave shape {list(loss.shape)}; give one number, such as its mean()")
     if not loss.requires_grad:
         raise CodeError(f"{where}.loss does not depend on the network that it is to teach: use self.network in it")
-    if paid.shape == (len(paid), config.size) and not kind.pays_features:
+    if paid.dim() == 2 and paid.shape[1] == config.size and not kind.pays_features:
         raise CodeError(f"{where}.paid gave shape {list(paid.shape)}; give [{len(paid)}], or set pays_features = True")
 
 

@@ -27,7 +27,7 @@ def resumed_config(directory: RunDirectory | Path, overrides: list[str], file: P
     read = partial(load_config, directory) if isinstance(directory, Path) else directory.read_config
     saved = read()
     try:
-        given = read(overrides) if file is None else load_config(file, overrides, saved.code)
+        given = read(overrides) if file is None else load_config(file, overrides, saved.code, saved.name)
     except ConfigError:
         tree: dict[str, Any] = {}
         for override in overrides:

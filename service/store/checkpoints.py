@@ -130,9 +130,9 @@ class CheckpointStore:
         # What another process writes in a higher epoch is not for this one to delete, and a damaged file that was
         # passed over, of whatever epoch and step, must not crowd out a good one.
         files = [path for epoch, step, path in self._files() if (epoch, step) <= (self.epoch, newest)]
-        oldest = [path for path in files if path not in self._damaged][-self.keep :][0]
+        kept = [path for path in files if path not in self._damaged][-self.keep :]
         try:
-            for path in files[: files.index(oldest)]:
+            for path in files[: files.index(kept[0])] if kept else ():  # none where the directory cannot be read
                 path.unlink(missing_ok=True)
             remove_temporaries(self.directory)
         except OSError as error:

@@ -58,6 +58,8 @@ def test_what_is_named_has_the_worlds_size_mass_and_friction_and_a_color_of_its_
     assert [(each.mass_kg, each.friction) for each in world.bodies] == [(0.3, 0.5), (0.3, 0.5), (0.3, 0.8)]
     assert [each.color for each in world.bodies] == [each.color for each in WorldConfig(objects=["cube"] * 3).bodies]
     assert WorldConfig.model_validate(world.model_dump()) == world
+    assert WorldConfig(objects=world.bodies).bodies == world.bodies
+    assert WorldConfig(objects=({**can, "mass_kg": None},)).object_mass_kg == 0.1
     harder = WorldConfig.model_validate(world.model_dump() | {"object_mass_kg": 1.0, "friction": 0.25})  # as of a task
     assert [(each.mass_kg, each.friction) for each in harder.bodies] == [(1.0, 0.25), (1.0, 0.25), (1.0, 0.8)]
 

@@ -69,6 +69,17 @@ def test_rounds_are_turns_of_both():
         np.testing.assert_array_equal(turn.actions, np.tile(np.float32(PUSH), (12, 1)))
 
 
+def test_rounds_without_alice_are_turns_of_bob():
+    alone = CONFIG.model_dump(mode="json") | {"generator": {"goal_source": "uniform", "replay_invalid": True}}
+    config = SelfPlayConfig.model_validate(alone | {"game": alone["game"] | {"alice_plays": False}})
+    rounds = play_rounds(config, Constant(NOTHING), Constant(PUSH), num_rounds=4, seed=0)
+    write_dataset("alone", played_turns(rounds), config, "here")
+    turns = list(minari.load_dataset("alone-v0").iterate_episodes())
+    assert len(turns) == 4
+    assert not any(each.infos["is_alice"].any() for each in turns)
+    assert all(len(each.observations["achieved_goal"]) == len(each.actions) + 1 for each in turns)
+
+
 def test_the_command_writes_the_champions_episodes_and_refuses_what_is_there(place):
     arguments = ("dataset", "panda-cube@champion", "--episodes", 4, "--goals", "0,0,0.2", "--out", "champion")
     done = tandem(*arguments)

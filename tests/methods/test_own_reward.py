@@ -86,6 +86,7 @@ def test_it_goes_the_way_of_ours(file, tmp_path):
     [
         ("dim=1).mean()", "dim=7).mean()", "upwards.py:10: IndexError: "),
         ("pays_features = True", "pays_features = False", "Upwards.paid gave shape [8, 3]; give [8], or set pays"),
+        ("- self.network(before)", ".mean()", "Upwards.paid gave float32 of shape (); give float of shape (8, 3)"),
         ("dim=1).mean() +", "dim=1) +", "Upwards.loss gave shape [8]; give one number, such as its mean()"),
         ("return -(self", "return 0.0; -(self", "Upwards.loss gave a float; give a torch.Tensor"),
         ("return -(self", "return after.mean(); -(self", "Upwards.loss does not depend on the network that it is to"),

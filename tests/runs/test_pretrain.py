@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from service.base.errors import ConfigError
-from service.config import parse_config
+from service.config import load_config, parse_config
 from service.envs import rules
 from service.envs.sampling import draw_goals
 from service.methods.method import StateLostError
@@ -243,6 +243,13 @@ def begun(tmp_path):
     directory.start(tiny_config(seed=3))
     directory.close()
     return directory
+
+
+def test_a_file_that_says_no_name_says_again_what_a_run_was_begun_with(begun, tmp_path):
+    file = write_yaml(tmp_path / "another.yaml", {key: value for key, value in TREE.items() if key != "name"})
+    assert load_config(file).name == "another"
+    assert load_config(file, ["name=mine"]).name == "mine"
+    assert resumed_config(begun, ["seed=3"], file) == tiny_config(seed=3)
 
 
 def test_a_resumed_run_keeps_its_configuration(begun):

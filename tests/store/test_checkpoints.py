@@ -1,5 +1,6 @@
 """A run continues from exactly what was saved, whatever happens to the files."""
 
+import errno
 import json
 import logging
 import subprocess
@@ -130,6 +131,20 @@ def test_a_damaged_file_of_an_earlier_process_never_crowds_out_a_good_one(tmp_pa
     assert store.steps() == [10, 15, 12]
     save(store, 14)
     assert store.steps() == [12, 14]
+
+
+def test_a_directory_that_cannot_be_read_for_a_moment_ends_no_run(
+    store: CheckpointStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save(store, 20)
+
+    def fails(path: Path) -> None:
+        raise OSError(errno.ESTALE, "stale")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "iterdir", fails)
+        save(store, 40)
+    assert store.steps() == [20, 40]
 
 
 def test_no_checkpoint_and_none_usable(store: CheckpointStore) -> None:
