@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from benchmarks.measuring import machine, one_line_errors, write_json
 from benchmarks.run_files import COUNTERS, FORMAT_VERSION, RANDOM, STAGES, Records, Run, blocks, thin
-from service.actors.coverage import NUM_SKILLS, RandomPolicy, skill_paths, skill_trajectories, visited_share
+from service.actors.coverage import NUM_SKILLS, RandomPolicy, composition_paths, skill_paths, visited_share
 from service.actors.evaluation import DeterministicPolicy, IdlePolicy, evaluate
 from service.base.errors import TandemError
 from service.base.tensors import split_parts
@@ -237,10 +237,10 @@ def measure_coverage(
         if isinstance(config, SkillDiscoveryConfig):
             return partial(skill_paths, FrozenSkills(parameters, config.skills), config.world, **common)
         bob = numpy_bob(parameters)
-        return partial(skill_trajectories, bob, config.world, **common) if isinstance(bob, NumpyMCPPolicy) else None
+        return partial(composition_paths, bob, config.world, **common) if isinstance(bob, NumpyMCPPolicy) else None
 
     found: dict[str, dict[str, Any]] = {
-        RANDOM: _measure_sets(partial(skill_trajectories, RandomPolicy(), config.world, **common), config, num_sets)
+        RANDOM: _measure_sets(partial(composition_paths, RandomPolicy(), config.world, **common), config, num_sets)
     }
     for name, env_steps in pick_stages(stages).items():
         if (play := player(stages[env_steps])) is None:

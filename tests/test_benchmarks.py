@@ -19,7 +19,7 @@ from benchmarks import (
 )
 from benchmarks.measuring import Sample
 from benchmarks.report.figures import quantiles
-from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
+from service.actors.coverage import RandomPolicy, composition_paths, visited_share
 from service.base.errors import TandemError
 from service.base.jsonl import JsonlWriter
 from service.config import WorldConfig, dump_config, load_config
@@ -319,7 +319,7 @@ def test_coverage_is_measured_at_each_stage_beside_a_random_policy():
     policies = [RandomPolicy(), *map(numpy_bob, bobs.values())]
     for policy, stage in zip(policies, found["stages"].values(), strict=True):
         paths = [
-            skill_trajectories(policy, config.world, num_skills=32, num_steps=12, seed=seed, num_threads=1)
+            composition_paths(policy, config.world, num_skills=32, num_steps=12, seed=seed, num_threads=1)
             for seed in (0, 1)
         ]
         assert stage["shares"] == [round(visited_share(each, config.world.workspace), 4) for each in paths]

@@ -35,9 +35,9 @@ def registry(run, tmp_path):
     """A registry with the run's Bob as version 1 and 2, and as the only version of another name."""
     registry = Registry(tmp_path / "registry")
     bob = load(str(run.path)).parameters
-    publish(registry, tiny_config(), bob, {"score": 0.25})
+    first = publish(registry, tiny_config(), bob, {"score": 0.25})
     changed = bob | {"gate.output.bias": bob["gate.output.bias"] + 1.0}
-    publish(registry, tiny_config(), changed, {"score": 0.5}, parent="tiny@1")
+    publish(registry, tiny_config(), changed, {"score": 0.5}, parent=first)
     other = {"gate.output.bias": bob["gate.output.bias"] + 2.0}
     publish(registry, tiny_config().model_copy(update={"name": "other"}), bob | other, {})
     return registry

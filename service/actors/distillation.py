@@ -40,8 +40,8 @@ class Lesson:
 
 
 @dataclass(frozen=True, slots=True)
-class Round:
-    """An episode of every world."""
+class Episodes:
+    """One of every world."""
 
     lesson: Lesson
     start: StateArray
@@ -56,7 +56,7 @@ class Round:
 
 
 class DistillationWorlds:
-    """Worlds in which a student acts; they begin anew with every round.
+    """Worlds in which a student acts; they begin anew with every call.
 
     Args:
         config: the run, with ``distillation``.
@@ -82,7 +82,7 @@ class DistillationWorlds:
         """Stop the worlds' threads."""
         self._worlds.close()
 
-    def play(self, student: NumpyMCPPolicy, rng: np.random.Generator) -> Round:
+    def play(self, student: NumpyMCPPolicy, rng: np.random.Generator) -> Episodes:
         """Play an episode in every world, and some steps more, so that each step of it has its label."""
         worlds, how = self._worlds, self._how
         num, distance_m = worlds.num_worlds, self._config.success_distance_m
@@ -101,7 +101,7 @@ class DistillationWorlds:
         lesson = Lesson(*(_rows(array) for array in (observation, *answers)))
         own = ~composed
         diverged, worlds.diverged = tuple(worlds.diverged), []
-        return Round(lesson, start[own], goal[own], reached[own], num * len(steps), diverged)
+        return Episodes(lesson, start[own], goal[own], reached[own], num * len(steps), diverged)
 
     def _step(
         self, student: NumpyMCPPolicy, goal: StateArray, composed: BoolArray, step: int, rng: np.random.Generator

@@ -169,9 +169,9 @@ def success_metrics(
     return metrics
 
 
-def wilson_interval(successes: int, num: int, z: float = 1.96) -> tuple[float, float]:
-    """Wilson score interval of a proportion (Wilson 1927); z = 1.96 gives 95 %."""
-    share = successes / num
+def wilson_interval(successes: int, num: int) -> tuple[float, float]:
+    """95 % Wilson score interval of a proportion (Wilson 1927)."""
+    z, share = 1.96, successes / num
     centre = (share + z * z / (2 * num)) / (1 + z * z / num)
     half = z * np.sqrt(share * (1 - share) / num + z * z / (4 * num * num)) / (1 + z * z / num)
     return float(max(centre - half, 0.0)), float(min(centre + half, 1.0))

@@ -39,7 +39,6 @@ class DirectoryLock:
 
     Args:
         directory: made when missing.
-        what_to_do: the end of the error's message.
 
     Raises:
         RunTakenError: another process, or another object in this one, has the lock; or the file system has no locks,
@@ -47,7 +46,7 @@ class DirectoryLock:
         StorageError: the directory cannot be written.
     """
 
-    def __init__(self, directory: Path, what_to_do: str) -> None:
+    def __init__(self, directory: Path) -> None:
         self._path = path = directory / LOCK_FILE
         with os_errors("write", path):
             directory.mkdir(parents=True, exist_ok=True)
@@ -67,7 +66,7 @@ class DirectoryLock:
             self._file.close()
             found = holder(directory)
             who = "another process" if found is None else f"process {found[1]} on {found[0]}"
-            raise RunTakenError(f"{directory} is in use by {who}; {what_to_do}")
+            raise RunTakenError(f"{directory} is in use by {who}; stop that one first, or name another --run-dir")
         note = {"pid": os.getpid(), "host": socket.gethostname()}
         with contextlib.suppress(OSError):  # a full disk: who has it is only told to people
             self._file.truncate(0)

@@ -24,6 +24,8 @@ MAX_JSON_NUMBER = 10**300
 """Greatest whole number in JSON: greater ones are no floats. States of random generators have 39 digits."""
 MAX_YAML_NUMBER = 2**63 - 1
 """Greatest whole number in YAML, which has configurations."""
+NAME = r"[a-z0-9][a-z0-9._-]{0,63}"
+"""What names are: no slash and no leading dot, so as part of a path none leads elsewhere."""
 MAX_YAML_CHARACTERS = 256 * 1024
 MAX_YAML_VALUES = 5000
 """Values of a YAML text, those that aliases repeat included; a configuration has 200."""

@@ -42,8 +42,8 @@ class Activity:
     bar: Bar
     """What rich knows of it, once a display shows it."""
 
-    def __init__(self, title: str, total: int | None = None, unit: str = "", done: int = 0) -> None:
-        self.title, self.total, self.unit, self.done = title, total, unit, done
+    def __init__(self, title: str, total: int | None = None, unit: str = "") -> None:
+        self.title, self.total, self.unit, self.done = title, total, unit, 0
         self.note = ""
         """What else is known, shown after the rest."""
         self.told_s = 0.0
@@ -58,14 +58,12 @@ class Activity:
 
 
 @contextmanager
-def doing(
-    title: str, total: int | None = None, unit: str = "", done: int = 0, *, aloud: bool = True
-) -> Iterator[Activity]:
+def doing(title: str, total: int | None = None, unit: str = "", *, aloud: bool = True) -> Iterator[Activity]:
     """Show the block as an activity, see ``Activity``.
 
     Plain lines tell at once of an activity without a total that is ``aloud``, as nothing of it can be counted.
     """
-    activity, display = Activity(title, total, unit, done), _open.get()
+    activity, display = Activity(title, total, unit), _open.get()
     if display is not None:
         display.begin(activity)
         if total is None and aloud and not display.moves:
@@ -93,7 +91,7 @@ def answer(text: str) -> None:
 
 
 class Display:
-    """Shows tasks on a console; as a context manager it is the one that is open.
+    """Shows activities on a console; as a context manager it is the one that is open.
 
     Args:
         console: of stderr, so that what a command prints for other programs stays by itself.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from safetensors import SafetensorError
@@ -15,6 +15,7 @@ from service.base.parsing import parse_json
 
 _SIZED = ("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float16", "float32", "float64")
 DTYPES = ("bool", *_SIZED, "complex64")
+Each = TypeVar("Each")
 
 
 def encode(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str] | None = None) -> bytes:
@@ -77,8 +78,8 @@ def describe(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     return {name: {"shape": list(arrays[name].shape), "dtype": arrays[name].dtype.name} for name in sorted(arrays)}
 
 
-def join_parts(parts: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """The arrays of several parts, each named ``PART/NAME``."""
+def join_parts(parts: Mapping[str, Mapping[str, Each]]) -> dict[str, Each]:
+    """What several parts hold, arrays or tensors, each named ``PART/NAME``."""
     return {f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
 
 

@@ -209,7 +209,7 @@ def coverage(
     if out.suffix.lower() != ".png":
         raise TandemError(f"--out {out}: the picture is a PNG; name a file that ends in .png")
     with loading():
-        from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
+        from service.actors.coverage import RandomPolicy, composition_paths, visited_share
         from service.media.artifacts import paths_of
         from service.media.plots import plot_coverage
         from service.registry.loading import load
@@ -217,7 +217,7 @@ def coverage(
         trained = load(reference, registry).expect("primitives", "skills", by="tandem coverage")
     world = trained.world
     path, of = paths_of(trained, skills, steps, seed)
-    random = skill_trajectories(RandomPolicy(), world, num_skills=skills, num_steps=steps, seed=seed)
+    random = composition_paths(RandomPolicy(), world, num_skills=skills, num_steps=steps, seed=seed)
     paths = {trained.label: path, "random policy": random}
     shares = {name: visited_share(path, world.workspace) for name, path in paths.items()}
     picture = plot_coverage(path, world.workspace, out, trained.label, of=of)

@@ -31,7 +31,14 @@ if TYPE_CHECKING:
 
 Planned = dict[str, tuple[Settings, Path | None, list[str]]]
 """By the name of a run its settings, the file of its configuration, and what is changed in that."""
-_MEASURED = ("success_last", "mixed_success_last", "table_success_last", "air_success_last", "coverage")
+_MEASURED = (
+    "success_last",
+    "mixed_success_last",
+    "table_success_last",
+    "air_success_last",
+    "one_success_last",
+    "coverage",
+)
 
 
 def is_study(run_dir: Path | None, seeds: str | None, grid: Sequence[str], *words: str | None) -> bool:

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from service.base.errors import ConfigError
+from service.base.parsing import NAME
 from service.config.frozen import FrozenModel, first_error
 from service.config.model_files import Vector, absolute, file_digest
 from service.config.tree import read_yaml
@@ -80,7 +81,7 @@ class RobotConfig(FrozenModel):
     servo, and only the gripper touches anything.
     """
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")
+    name: str = Field(pattern=f"^{NAME}$")
     model: str | None = Field(
         None,
         description="MJCF or URDF file, from where the description is; package:NAME/FILE for one in a Python package. "

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field
 
+from service.base.parsing import NAME
 from service.config.frozen import FrozenModel
 from service.config.world import WorldConfig
 
@@ -38,9 +39,7 @@ class RunConfig(FrozenModel):
 class Config(FrozenModel):
     """A run: the keys that all methods have. A method's own class adds its keys, and makes it."""
 
-    name: str = Field(
-        "panda-cube", pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$", description="registry name of what it makes"
-    )
+    name: str = Field("panda-cube", pattern=f"^{NAME}$", description="registry name of what it makes")
     seed: int = Field(0, ge=0, le=2**32 - 1)
     method: str = Field(
         description="a name of ``tandem methods``; or FILE.py, FILE.py:CLASS or MODULE:CLASS, a class of yours"

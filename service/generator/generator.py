@@ -13,7 +13,7 @@ from service.envs.state_layout import StateLayout
 from service.generator.bins import GoalCells, TaskBins
 from service.generator.difficulty import DifficultyGrid, SuccessCounts, novelty
 from service.generator.opponents import Opponents
-from service.generator.records import GoalSummary, height_percentile, means
+from service.generator.records import GoalSummary, height_p90_m, means
 from service.generator.ring import Ring
 from service.generator.snapshot import GeneratorSnapshot
 
@@ -129,7 +129,7 @@ class TaskGenerator:
         self._stop.record(num_new_cells, int(summary.task_tries.sum()), int(summary.task_successes.sum()))
         metrics = {
             **means(summary.metrics),
-            "alice/goal_height_p90_m": height_percentile(summary.heights, 90.0),
+            "alice/goal_height_p90_m": height_p90_m(summary.heights),
             "generator/num_cells_seen": float(self.grid.num_cells_seen),
             "generator/num_cells_reached": float(np.count_nonzero(self.grid.reached)),
             "generator/new_cells": float(num_new_cells),

@@ -166,12 +166,12 @@ def count_heights(records: GoalRecords, world: WorldConfig) -> IntArray:
     return np.bincount(np.clip(steps, 0, NUM_HEIGHT_STEPS - 1), minlength=NUM_HEIGHT_STEPS)
 
 
-def height_percentile(heights: IntArray, percent: float) -> float:
-    """The height up to which so many per cent of ``count_heights`` lie, metres; not-a-number while there are none."""
+def height_p90_m(heights: IntArray) -> float:
+    """The height up to which 90 % of ``count_heights`` lie, metres; not-a-number while there are none."""
     counted = np.cumsum(heights)
     if not counted[-1]:
         return float("nan")
-    return float(np.searchsorted(counted, counted[-1] * percent / 100.0) + 0.5) * HEIGHT_STEP_M
+    return float(np.searchsorted(counted, counted[-1] * 0.9) + 0.5) * HEIGHT_STEP_M
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,14 @@ class Verdict(enum.IntEnum):
     FALLEN = 3
 
 
+NO_GOAL = {
+    Verdict.NOT_MOVED: "nothing was moved far",
+    Verdict.OUTSIDE: "it left the workspace",
+    Verdict.FALLEN: "it fell off the table",
+}
+"""Why a proposal is no goal, as people are told."""
+
+
 def in_workspace(position: FloatArray | StateArray, workspace: WorkspaceConfig) -> BoolArray:
     """Whether each (..., 3) position in metres lies in the box, its faces included; not-a-number lies outside."""
     inside: BoolArray = np.all((position >= workspace.lower_m) & (position <= workspace.upper_m), axis=-1)

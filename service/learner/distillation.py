@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
 from service.actors.distillation import Lesson
+from service.base.tensors import join_parts
 from service.base.types import Array, Arrays, FloatArray, Metrics
 from service.config.distillation import DistillationConfig
 from service.policies import networks
@@ -108,4 +109,4 @@ class Distiller:
     def _tensors(self) -> dict[str, Tensor]:
         parts: dict[str, Mapping[str, Tensor]] = {"student": self._parameters, "average": self._average}
         parts["adam"] = self._optimizer.tensors()
-        return {f"{part}/{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}
+        return join_parts(parts)

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from service.base.tensors import join_parts
 from service.base.types import Array, Arrays
 from service.config.self_play import PPOConfig
 from service.policies import gaussian
@@ -50,4 +51,4 @@ class Player:
 
     def tensors(self) -> dict[str, Tensor]:
         """Parameters and Adam's state by name: the tensors themselves, always in the same order."""
-        return self._parameters | {f"adam/{name}": tensor for name, tensor in self.optimizer.tensors().items()}
+        return self._parameters | join_parts({"adam": self.optimizer.tensors()})

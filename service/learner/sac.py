@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from service.base.tensors import join_parts
 from service.base.types import Array, Arrays, FloatArray, Metrics
 from service.config.skills import SACConfig
 from service.learner.sac_networks import Critics, sample_actions
@@ -152,7 +153,7 @@ class SACLearner:
         parts |= {f"adam/{name}": optimizer.tensors() for name, optimizer in self._optimizers.items()}
         parts |= {"targets": dict(self._targets.named_parameters()), "average": self._average}
         parts["count"] = {"averaged": self._num_averaged}
-        return {f"{part}/{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}
+        return join_parts(parts)
 
     def _step(
         self, inputs: Tensor, actions: Tensor, rewards: Tensor, next_inputs: Tensor, weights: Tensor | None = None

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from service.actors.coverage import NUM_SKILLS, skill_paths, skill_trajectories
+from service.actors.coverage import NUM_SKILLS, composition_paths, skill_paths
 from service.base.errors import TandemError
 from service.base.progress import track
 from service.base.types import StateArray
@@ -78,7 +78,7 @@ def paths_of(trained: Trained, num: int, num_steps: int, seed: int) -> tuple[Sta
     if trained.kind == "skills":
         return skill_paths(trained.skills, trained.world, num_skills=num, num_steps=num_steps, seed=seed), "skill"
     return (
-        skill_trajectories(trained.primitives, trained.world, num_skills=num, num_steps=num_steps, seed=seed),
+        composition_paths(trained.primitives, trained.world, num_skills=num, num_steps=num_steps, seed=seed),
         "composition" if trained.world.num_objects == 1 else "path",
     )
 

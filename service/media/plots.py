@@ -31,6 +31,7 @@ from service.media.figures import (
     save,
     style_axes,
 )
+from service.store.models import GOALS_FILE, METRICS_FILE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -190,7 +191,7 @@ def plot_curves(run_dir: Path, method: str = "self-play") -> Path:
     Raises:
         TandemError: the run has no metrics yet, they are damaged, or the picture cannot be written.
     """
-    records = read_records(run_dir / "metrics.jsonl")
+    records = read_records(run_dir / METRICS_FILE)
     panels = _PANELS.get(method, _TASK)
     num_rows = len(panels) // 3
     figure = new_figure(14.0, 3.9 * num_rows, f"{run_dir.resolve().name}: {_progress(records)}")
@@ -219,7 +220,7 @@ def plot_study(run_dirs: Mapping[str, Path], path: Path) -> Path:
     found = {}
     for label, run_dir in run_dirs.items():
         with suppress(TandemError):
-            found[label] = read_records(run_dir / "metrics.jsonl")
+            found[label] = read_records(run_dir / METRICS_FILE)
     if not found:
         raise TandemError(f"no run in {path.parent} has metrics yet; wait for a first iteration")
     figure = new_figure(14.0, 5.2, f"{path.parent.resolve().name}: {counted(len(found), 'run')}")
@@ -314,7 +315,7 @@ def plot_goals(run_dir: Path, workspace: WorkspaceConfig) -> Path:
     """
     from matplotlib.lines import Line2D
 
-    records = read_records(run_dir / "goals.jsonl")
+    records = read_records(run_dir / GOALS_FILE)
     figure = new_figure(14.0, 7.8, f"{run_dir.resolve().name}: where Alice's goals are, and which of them Bob solves")
     columns = figure.subplots(2, _NUM_SLICES, sharex="row", sharey="row").T
     for (above, side), slice_ in zip(columns, np.array_split(np.arange(len(records)), _NUM_SLICES), strict=True):
@@ -382,12 +383,12 @@ _MOVED_M = 0.05
 
 
 def plot_coverage(
-    trajectories: StateArray, workspace: WorkspaceConfig, path: Path, title: str, *, of: str = "composition"
+    paths: StateArray, workspace: WorkspaceConfig, path: Path, title: str, *, of: str = "composition"
 ) -> Path:
     """Draw the paper's figure of a skill set: where random compositions, or random skills, take the object.
 
     Args:
-        trajectories: (M, T, 3) object positions in metres in the world's frame, one row each.
+        paths: (M, T, 3) object positions in metres in the world's frame, one row each.
         workspace: the box to draw; points more than a few centimetres outside it are left out.
         path: the PNG to write.
         title: whose they are, for example the primitives' name and version.
@@ -396,10 +397,10 @@ def plot_coverage(
     Raises:
         TandemError: the picture cannot be written.
     """
-    figure = new_figure(14.0, 7.2, f"{title}, {_summary(trajectories, workspace, of)}")
+    figure = new_figure(14.0, 7.2, f"{title}, {_summary(paths, workspace, of)}")
     box = figure.add_axes((0.0, 0.0, 0.57, 0.95), projection="3d", computed_zorder=False)
     above = figure.add_axes((0.62, 0.1, 0.36, 0.74))
-    draw_paths(box, above, trajectories, workspace)
+    draw_paths(box, above, paths, workspace)
     above.set_ylabel("y (m)", color=FAINT)
     above.set_title("From above; a dot is where the object ends", loc="left", fontsize=12, color=INK)
     return save(figure, path)
@@ -437,12 +438,10 @@ def _inside(points: StateArray, workspace: WorkspaceConfig) -> StateArray:
     return np.where(near.all(axis=1, keepdims=True), points, np.nan)
 
 
-def _summary(trajectories: StateArray, workspace: WorkspaceConfig, of: str) -> str:
-    share = visited_share(trajectories, workspace)
-    moved = (np.linalg.norm(trajectories - trajectories[:, :1], axis=2) > _MOVED_M).any(axis=1).sum()
-    return (
-        f"{share:.0%} of the table's cells visited: {counted(len(trajectories), of)}, {moved} move the object over 5 cm"
-    )
+def _summary(paths: StateArray, workspace: WorkspaceConfig, of: str) -> str:
+    share = visited_share(paths, workspace)
+    moved = (np.linalg.norm(paths - paths[:, :1], axis=2) > _MOVED_M).any(axis=1).sum()
+    return f"{share:.0%} of the table's cells visited: {counted(len(paths), of)}, {moved} move the object over 5 cm"
 
 
 def _draw_box(axes: Any, workspace: WorkspaceConfig) -> None:

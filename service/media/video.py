@@ -20,7 +20,7 @@ from service.base.progress import track
 from service.config import WorldConfig
 from service.envs.rendering.camera import DEFAULT_VIEW, CameraView
 from service.envs.rendering.renderer import Image, SceneRenderer
-from service.generator.validity import Verdict
+from service.generator.validity import NO_GOAL, Verdict
 from service.media.encoding import encode
 from service.media.recording import RecordedEpisodes, RecordedRound
 
@@ -38,11 +38,6 @@ GOAL_PAUSE_S, END_PAUSE_S = 0.4, 0.8
 
 _PAPER, _INK, _FAINT = (248, 248, 248), (34, 34, 34), (140, 140, 140)
 _BLUE, _ORANGE, _GREEN = (0, 114, 178), (213, 94, 0), (0, 138, 100)
-_NO_GOAL = {
-    Verdict.NOT_MOVED: "nothing was moved far",
-    Verdict.OUTSIDE: "it left the workspace",
-    Verdict.FALLEN: "it fell off the table",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +134,7 @@ def _round_frames(
         picture = renderer.render(played.alice_states[step])
         yield np.hstack([_caption(picture, "Alice proposes a goal", _ORANGE), right])
     if played.verdict != Verdict.VALID:
-        left = _caption(picture, f"Alice: no goal, {_NO_GOAL[played.verdict]}", _ORANGE)
+        left = _caption(picture, f"Alice: no goal, {NO_GOAL[played.verdict]}", _ORANGE)
         yield from _hold(np.hstack([left, right]), END_PAUSE_S, frame_s)
         return
     left = _caption(picture, "Alice proposed this goal", _INK)

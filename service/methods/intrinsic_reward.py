@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from service.base.tensors import join_parts
 from service.base.types import Array, Arrays, FloatArray
 from service.config.skills import Prior, SkillsConfig, ZeroShot
 from service.learner.sac import ADAM_EPSILON
@@ -95,7 +96,7 @@ class IntrinsicReward:
     def tensors(self) -> dict[str, Tensor]:
         """Everything that changes but random numbers, by name: the tensors themselves."""
         parts = {"network": self.network.state_dict(keep_vars=True), "adam": self._optimizer.tensors()}
-        return {f"{part}/{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}
+        return join_parts(parts)
 
 
 def along(step: Tensor, skill: Tensor) -> Tensor:

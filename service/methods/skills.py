@@ -84,9 +84,8 @@ class SkillDiscovery(Method):
     def state(self) -> State:
         """The off-policy loop with its replay buffer, the reward's network, and the visits."""
         arrays, values = self._loop.state()
-        reward = {f"reward/{name}": array for name, array in self._batches.reward.state().items()}
         return {
-            "loop": {**arrays, **reward},
+            "loop": arrays | join_parts({"reward": self._batches.reward.state()}),
             "skills": dict(self.parameters()),  # for readers without torch
             "visits": {"cells": self._visits},
             "random": values,

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
+from service.base.tensors import join_parts
 from service.base.types import Array, Arrays
 
 
@@ -60,7 +61,7 @@ class Adam:
 
     def tensors(self) -> dict[str, Tensor]:
         """Moments and step counts by name: the tensors themselves."""
-        return {f"{part}/{name}": tensor for part, tensors in self._state.items() for name, tensor in tensors.items()}
+        return join_parts(self._state)
 
 
 def copied(tensors: Mapping[str, Tensor]) -> Arrays:

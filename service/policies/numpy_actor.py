@@ -111,7 +111,7 @@ def numpy_actor(parameters: Parameters) -> NumpyActor:
 
 
 def relu_shapes(parameters: Parameters, name: str, num_outputs: int | None = None) -> Shapes:
-    """Shapes that layers of ``networks.make_layers`` below a name need to fit together.
+    """Shapes that layers of ``sac_networks.make_layers`` below a name need to fit together.
 
     Raises:
         PolicyError: the first is missing, or a weight is no matrix.

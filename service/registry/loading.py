@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 
 from service.base.errors import ConfigError, TandemError
+from service.base.parsing import NAME
 from service.base.tensors import digest_of, split_parts
 from service.base.types import Array, FloatArray
 from service.base.user_code import changed_since, parse_reference
@@ -36,7 +37,6 @@ from service.policies.parameters import Parameters, PolicyError
 from service.registry.bundled import BUNDLED, find_version, is_bundled, is_exported
 from service.registry.learned import LearnedPolicy
 from service.registry.manifest import Manifest, acting_config
-from service.registry.names import NAME_PATTERN
 from service.store.checkpoints import Checkpoint, CheckpointStore, read_checkpoint
 from service.store.run_directory import Published, RunDirectory
 
@@ -340,7 +340,7 @@ def _load_version(reference: str, registry: Path | str, primitives: str | None, 
         spaces: dict[str, Any] = dict(manifest.spaces)
         try:
             name, digest, hold_steps = spaces["primitives"], spaces["primitives_digest"], spaces["hold_steps"]
-            if re.fullmatch(rf"{NAME_PATTERN.strip('^$')}@[0-9]+", str(name)) is None:  # a directory could bring code
+            if re.fullmatch(f"{NAME}@[0-9]+", str(name)) is None:  # a directory could bring code
                 raise TandemError(f"{label}: it acts with {name!r}, which is no NAME@VERSION; publish it again")
             about: dict[str, Any] = {
                 "task": _task_of(spaces, manifest, label, run_code=run_task_code),

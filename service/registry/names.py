@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from service.base.errors import RegistryError
+from service.base.parsing import NAME
 
 LATEST = "latest"
-NAME_PATTERN = r"^[a-z0-9][a-z0-9._-]{0,63}$"  # the same as Config.name; no slash and no leading dot: no path leaves
 _RULE = "use 1 to 64 of a-z, 0-9, '.', '_', '-', the first a letter or digit"
 
 
@@ -48,7 +48,7 @@ def check_alias(alias: str) -> str:
 
 def is_name(text: str) -> bool:
     """Whether ``text`` follows the rule for names."""
-    return re.fullmatch(NAME_PATTERN.strip("^$"), text) is not None
+    return re.fullmatch(NAME, text) is not None
 
 
 def is_service(registry: Path | str) -> bool:

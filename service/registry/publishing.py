@@ -94,7 +94,7 @@ def publish(
     parameters: Parameters,
     metrics: dict[str, float],
     *,
-    parent: str | Version | None = None,
+    parent: Version | None = None,
     history: Mapping[str, Any] | None = None,
 ) -> Version:
     """Publish what a run has learned, with everything a user needs; the spaces in the manifest say what it is.

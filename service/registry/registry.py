@@ -82,7 +82,7 @@ class Registry:
         normalisation: Mapping[str, Any],
         config: Mapping[str, Any],
         metrics: Mapping[str, float],
-        parent: str | Version | None = None,
+        parent: Version | None = None,
         history: Mapping[str, Any] | None = None,
     ) -> Version:
         """Make the next version of ``name`` and move ``latest`` to it.
@@ -96,12 +96,11 @@ class Registry:
             normalisation: the network's fixed input normalisation, plain JSON values.
             config: configuration of the run, plain JSON values.
             metrics: finite numbers.
-            parent: the version this one was trained on from; a reference is looked up here, and must exist.
+            parent: the version this one was trained on from.
             history: of the run, where not all went as it was begun; plain JSON values.
 
         Raises:
             RegistryError: a bad name, array or value, or a registry that is only read; nothing is written.
-            UnknownVersionError: no such parent.
             StorageError: the disk cannot be written; what was there before is intact.
         """
         self.check_writable()
@@ -114,7 +113,7 @@ class Registry:
             "normalisation": dict(normalisation),
             "config": dict(config),
             "metrics": dict(metrics),
-            "parent": str(self.resolve(parent) if isinstance(parent, str) else parent) if parent is not None else None,
+            "parent": str(parent) if parent is not None else None,
             "history": dict(history) if history is not None else None,
             "git_commit": git_commit(),
         }

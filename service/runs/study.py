@@ -109,7 +109,7 @@ class Study:
             RunTakenError: another process runs it.
             StorageError: the directory cannot be written.
         """
-        self._lock = DirectoryLock(self.path, "stop that one first, or name another --run-dir")
+        self._lock = DirectoryLock(self.path)
 
     def close(self) -> None:
         """Let other processes in; a second call does nothing."""

@@ -11,9 +11,10 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as InPath
 
 from service.base.errors import DamagedBlobError, FormatVersionError, RegistryError
+from service.base.parsing import NAME
 from service.registry.bundled import BUNDLED, find_version, is_bundled
 from service.registry.manifest import Manifest
-from service.registry.names import NAME_PATTERN, Version
+from service.registry.names import Version
 from service.registry.registry import Registry
 from service.status.files import BYTES, PARTS, file_response
 from service.status.problems import INVALID, READ_ONLY, ProblemError, problems
@@ -30,9 +31,9 @@ from service.status.schemas import (
 
 MAX_VERIFIED = 4096
 _FOREVER = "private, max-age=31536000, immutable"
-_Name = Annotated[str, InPath(pattern=NAME_PATTERN, examples=["panda-cube"])]
+_Name = Annotated[str, InPath(pattern=f"^{NAME}$", examples=["panda-cube"])]
 _Alias = Annotated[str, InPath(pattern=r"^([a-z]|[0-9]+[a-z._-])[a-z0-9._-]*$", max_length=64, examples=["champion"])]
-_Version = Annotated[str, InPath(pattern=NAME_PATTERN, description="a number or an alias", examples=["champion"])]
+_Version = Annotated[str, InPath(pattern=f"^{NAME}$", description="a number or an alias", examples=["champion"])]
 _Digest = Annotated[str, InPath(pattern=r"^[0-9a-f]{64}$", description="a manifest's `blob_sha256`")]
 _UNKNOWN = (404, "There is no such name, version or alias.")
 

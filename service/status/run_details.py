@@ -17,7 +17,16 @@ from service.config.tree import read_yaml
 from service.generator.records import of_furthest
 from service.status.schemas import GoalFrame, GoalFrames, RunCommand, RunLog, RunSetup
 from service.store.disk_reader import is_study
-from service.store.models import ACTIVE, MAX_BYTES, OUTPUT_FILE, STUDY_FILE, GoalGrid, RunStatus
+from service.store.models import (
+    ACTIVE,
+    CONFIG_FILE,
+    GOALS_FILE,
+    MAX_BYTES,
+    OUTPUT_FILE,
+    STUDY_FILE,
+    GoalGrid,
+    RunStatus,
+)
 from service.store.run_history import read_history
 from service.store.run_log import LogLine, read_log
 
@@ -31,7 +40,7 @@ def setup(run: RunStatus, directory: Path | None, registry: Path) -> RunSetup:
         return RunSetup(run_id=run.run_id, directory=None, config=None, stop_command=None, resume_command=None)
     config, problem = None, None
     try:
-        config = read_yaml(file := directory / "config.yaml")
+        config = read_yaml(file := directory / CONFIG_FILE)
     except ConfigError as error:
         problem = str(error) if file.exists() else f"{file} is not there: the run has only begun, or it was removed"
     path = directory.absolute()
@@ -103,7 +112,7 @@ def goal_frames(directory: Path | None, grid: GoalGrid | None, num_frames: int) 
     frames = []
     if directory is not None:
         try:
-            with open_regular(directory / "goals.jsonl") as file:
+            with open_regular(directory / GOALS_FILE) as file:
                 size = file.seek(0, 2)
                 for index in range(num_frames):
                     begin, end = size * index // num_frames, size * (index + 1) // num_frames
@@ -124,7 +133,7 @@ def _frame(lines: list[bytes], lower: np.ndarray[Any, np.dtype[np.float64]], cel
     steps, rows = list[int](), list[Any]()
     for line in lines:
         try:
-            record = parse_json(line, "goals.jsonl")
+            record = parse_json(line, GOALS_FILE)
             goals = of_furthest(record["goals"])
             steps.append(int(record["env_steps"]))
         except (ParseError, KeyError, TypeError, ValueError):

@@ -21,7 +21,7 @@ from service.base.version import LEARNING_VERSION
 from service.config.task_methods import TASK_METHODS
 from service.config.tree import leaves, read_yaml
 from service.status.schemas import TaskCell, TaskColumn, TaskRow, TaskTable
-from service.store.models import RunStatus, Trial
+from service.store.models import CONFIG_FILE, RunStatus, Trial
 from service.store.run_directory import RESULT_FILE, RunDirectory
 
 Column = tuple[str, int]
@@ -93,7 +93,7 @@ def task_table(statuses: Iterable[RunStatus], directories: Mapping[str, Path]) -
 
 def _read(status: RunStatus, trial: Trial, path: Path) -> _Run:
     """A run that learns a task. Its configuration is taken as data: no method of a user's own is imported."""
-    config = path / "config.yaml"
+    config = path / CONFIG_FILE
     settings = _settings(config, config.stat().st_mtime_ns)
     result = RunDirectory(path).read_result()
     if result is not None:

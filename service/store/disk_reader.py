@@ -20,8 +20,10 @@ from service.base.lock import holder, is_locked, newest_epoch
 from service.base.parsing import ParseError, parse_with
 from service.store.models import (
     ACTIVE,
-    GOALS_FILE,
+    CONFIG_FILE,
+    GRID_FILE,
     MAX_BYTES,
+    METRICS_FILE,
     SILENT_AFTER,
     STATUS_FILE,
     STOP_FILE,
@@ -138,12 +140,12 @@ class DiskReader(RunReader):
     def goals(self, run_id: str) -> GoalGrid | None:
         with self._using(run_id) as path:
             try:
-                return parse_with(GoalGrid.model_validate_json, read_regular(path / GOALS_FILE, MAX_BYTES), path)
+                return parse_with(GoalGrid.model_validate_json, read_regular(path / GRID_FILE, MAX_BYTES), path)
             except FileNotFoundError:
                 return None
             except ParseError:
                 raise DamagedStoreError(
-                    f"{path / GOALS_FILE} is no goal grid; delete it, a run writes it anew"
+                    f"{path / GRID_FILE} is no goal grid; delete it, a run writes it anew"
                 ) from None
 
     @override
@@ -224,7 +226,7 @@ class DiskReader(RunReader):
         return self._found
 
     def _records_of(self, path: Path) -> RecordFile:
-        return self._records.setdefault(path, RecordFile(path / "metrics.jsonl"))
+        return self._records.setdefault(path, RecordFile(path / METRICS_FILE))
 
 
 def _is_run(path: Path) -> bool:
@@ -237,7 +239,7 @@ def _is_run(path: Path) -> bool:
         return False
     except OSError:  # such as a loop of links, or no permission; the status says which
         return True
-    return any(os.path.isfile(path / name) for name in (STATUS_FILE, "config.yaml"))
+    return any(os.path.isfile(path / name) for name in (STATUS_FILE, CONFIG_FILE))
 
 
 def _damaged(run_id: str, path: Path, cause: str) -> RunStatus:

@@ -29,8 +29,13 @@ from service.config.frozen import FrozenModel
 
 MAX_BYTES = 64 * 1024 * 1024
 """Greatest size of a file of JSON in the directory of a run or a study, but for records."""
+CONFIG_FILE = "config.yaml"
+METRICS_FILE = "metrics.jsonl"
+"""Records, one line for each iteration."""
+GOALS_FILE = "goals.jsonl"
+"""The grid of goals once in a while, one line each; newest of all is what ``GRID_FILE`` has."""
 STATUS_FILE = "status.json"
-GOALS_FILE = "goals.json"
+GRID_FILE = "goals.json"
 STOP_FILE = "stop"
 STUDY_FILE = "study.json"
 """In the directory of a study, which has a run directory for each of its runs."""

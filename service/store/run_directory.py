@@ -48,7 +48,7 @@ from service.base.types import FloatArray, StateArray
 from service.base.version import LEARNING_VERSION, git_commit
 from service.config import Config, dump_config, load_config
 from service.store.checkpoints import CheckpointStore
-from service.store.models import STUDY_FILE
+from service.store.models import CONFIG_FILE, GOALS_FILE, METRICS_FILE, STUDY_FILE
 from service.store.run_history import (
     BEFORE,
     Event,
@@ -110,9 +110,9 @@ class RunDirectory:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.config_file = path / "config.yaml"
-        self.metrics_file = path / "metrics.jsonl"
-        self.goals_file = path / "goals.jsonl"
+        self.config_file = path / CONFIG_FILE
+        self.metrics_file = path / METRICS_FILE
+        self.goals_file = path / GOALS_FILE
         self.checkpoints = path / "checkpoints"
         self.snapshots = path / "snapshots"
         self.published_file = path / "published.json"
@@ -228,7 +228,7 @@ class RunDirectory:
             CheckpointStore(self.checkpoints, keep=1).check_any()
         else:
             self._check_free()
-        self._lock = DirectoryLock(self.path, "stop that one first, or name another --run-dir")
+        self._lock = DirectoryLock(self.path)
         if not resume:
             self._check_free()  # of two that begin at once, the second sees here what the first has made
         self.history = (read_history(self.path) if resume else None) or self.history

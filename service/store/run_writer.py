@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from service.base.files import os_errors, write_atomic
 from service.store.address import RedisAddress
 from service.store.models import (
-    GOALS_FILE,
+    GRID_FILE,
     STATUS_FILE,
     STOP_FILE,
     Condition,
@@ -100,7 +100,7 @@ class RunWriter:
 
     def goals(self, grid: GoalGrid) -> None:
         """Replace the grid; its file is written with the next status."""
-        self._waiting[GOALS_FILE] = grid
+        self._waiting[GRID_FILE] = grid
         if self._redis is not None:
             self._redis.goals(grid)
 

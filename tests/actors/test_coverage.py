@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.actors.coverage import RandomPolicy, skill_trajectories, visited_share
+from service.actors.coverage import RandomPolicy, composition_paths, visited_share
 from service.config import WorkspaceConfig, WorldConfig
 
 # x and y from -0.1 to 0.1: 4 x 4 cells of 5 cm
@@ -66,7 +66,7 @@ class Recorder:
 
 
 def walk(primitives, *, num_skills=6, num_steps=4, seed=0):
-    return skill_trajectories(primitives, FAST, num_skills=num_skills, num_steps=num_steps, seed=seed, num_threads=1)
+    return composition_paths(primitives, FAST, num_skills=num_skills, num_steps=num_steps, seed=seed, num_threads=1)
 
 
 def test_a_skill_is_one_weight_held_for_the_whole_episode():

@@ -136,7 +136,6 @@ def test_wilson_interval_at_the_ends():
     # z^2 / (n + z^2) with n = 10: 3.8416 / 13.8416
     assert wilson_interval(0, 10) == pytest.approx((0.0, 3.8416 / 13.8416))
     assert wilson_interval(10, 10) == pytest.approx((10 / 13.8416, 1.0))
-    assert wilson_interval(5, 10, z=0.0) == (0.5, 0.5)
 
 
 # --- evaluate --------------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ HOLD = """
 import sys, time
 from pathlib import Path
 from service.base.lock import DirectoryLock
-lock = DirectoryLock(Path(sys.argv[1]), "wait")
+lock = DirectoryLock(Path(sys.argv[1]))
 print("locked", flush=True)
 time.sleep(60)
 """
@@ -35,21 +35,21 @@ def other(tmp_path):
 
 def test_a_second_process_is_refused_in_one_line_until_the_first_is_killed(tmp_path, other, monkeypatch):
     with pytest.raises(RunTakenError) as error:
-        DirectoryLock(tmp_path, "name another one")
-    assert_one_line(error.value, tmp_path, f"process {other.pid} on {os.uname().nodename}", "name another one")
+        DirectoryLock(tmp_path)
+    assert_one_line(error.value, tmp_path, f"process {other.pid} on {os.uname().nodename}", "name another --run-dir")
     assert is_locked(tmp_path)
     monkeypatch.setattr(lock, "WAIT_S", 600.0)  # it is waited for
     start_s = time.monotonic()
     signal.signal(signal.SIGALRM, lambda *_: other.kill())
     signal.setitimer(signal.ITIMER_REAL, 0.2)
-    DirectoryLock(tmp_path, "").release()
+    DirectoryLock(tmp_path).release()
     assert time.monotonic() - start_s >= 0.2
     assert not is_locked(tmp_path)
 
 
 def test_asking_does_not_take_the_lock(tmp_path):
     assert not is_locked(tmp_path)
-    first = DirectoryLock(tmp_path, "")
+    first = DirectoryLock(tmp_path)
     assert is_locked(tmp_path)
     assert is_locked(tmp_path)
     first.release()
@@ -60,10 +60,10 @@ def test_asking_does_not_take_the_lock(tmp_path):
 def test_a_damaged_lock_file_is_as_good_as_any(tmp_path, monkeypatch):
     monkeypatch.setattr(lock, "WAIT_S", 0.0)
     (tmp_path / ".lock").write_bytes(b"\xff{")
-    first = DirectoryLock(tmp_path, "")
+    first = DirectoryLock(tmp_path)
     (tmp_path / ".lock").write_bytes(b"\xff{")
     with pytest.raises(RunTakenError, match="in use by another process"):  # an object counts as a process does
-        DirectoryLock(tmp_path, "")
+        DirectoryLock(tmp_path)
     first.release()
 
 
@@ -75,7 +75,7 @@ def test_what_is_no_lock_file_is_not_written(tmp_path, make, reason):
     (tmp_path / "precious").write_text("precious")
     make(tmp_path / ".lock")
     with pytest.raises(StorageError) as error:
-        DirectoryLock(tmp_path, "")
+        DirectoryLock(tmp_path)
     assert_one_line(error.value, "cannot write", tmp_path / ".lock", reason)
     assert not is_locked(tmp_path)
     assert (tmp_path / "precious").read_text() == "precious"
@@ -87,11 +87,11 @@ def test_a_file_system_without_locks_is_refused_unless_one_says_so(tmp_path, mon
 
     monkeypatch.setattr("fcntl.flock", unsupported)
     with pytest.raises(RunTakenError) as error:
-        DirectoryLock(tmp_path, "")
+        DirectoryLock(tmp_path)
     assert_one_line(error.value, tmp_path, "no locks", "Operation not supported", "TANDEM_WITHOUT_LOCKS=1")
     monkeypatch.setenv("TANDEM_WITHOUT_LOCKS", "1")
     with caplog.at_level(logging.WARNING):
-        DirectoryLock(tmp_path, "").release()
+        DirectoryLock(tmp_path).release()
     assert_one_line(caplog.messages[0], tmp_path, "no locks", "Operation not supported")
 
 

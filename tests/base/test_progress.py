@@ -65,7 +65,8 @@ def test_a_plain_line_every_ten_seconds(clock):
 
 
 def test_what_was_done_before_does_not_count_as_fast(clock):
-    with Display(console(), get_time=clock) as shown, doing("learning", 1000, "env steps", done=902) as task:
+    with Display(console(), get_time=clock) as shown, doing("learning", 1000, "env steps") as task:
+        task.advance(902)
         for _ in range(2):
             clock.now_s += 1875.0
             task.advance(25)

@@ -225,7 +225,7 @@ def test_what_is_wrong_with_the_directory_or_with_ray_is_said_and_leaves_nothing
     assert_refused(result, "error: --address 127.0.0.1:1: no Ray cluster answers there", code=1)
     assert list(tmp_path.iterdir()) == []
     monkeypatch.setattr("service.cluster.ray_connection.connected", lambda address: pytest.fail("it takes a minute"))
-    lock = DirectoryLock(tmp_path / "run", "")
+    lock = DirectoryLock(tmp_path / "run")
     assert_refused(tandem(*arguments, "--status", "off"), tmp_path / "run", f"in use by process {os.getpid()} on ")
     lock.release()
 

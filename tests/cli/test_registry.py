@@ -25,8 +25,7 @@ BUNDLED_NAMES = ("panda-cube", "panda-cube-robust", "panda-two-cubes")
 @pytest.fixture
 def run(registry: Registry, publish: Publish) -> Run:
     """Run a command on a registry of two versions."""
-    publish()
-    publish(value=1.0, parent="panda-cube@1")
+    publish(value=1.0, parent=publish())
 
     return partial(tandem, "registry", TANDEM_REGISTRY=str(registry.root))
 

@@ -104,7 +104,7 @@ def test_what_was_learned_is_published_measured_and_filmed(learned, monkeypatch)
 
 def test_an_interrupted_run_is_published_and_a_running_one_is_not(tmp_path):
     play(tmp_path / "run", kill_after=3)
-    lock = DirectoryLock(tmp_path / "run", "")
+    lock = DirectoryLock(tmp_path / "run")
     assert_refused(tandem("publish", "run", "--name", "early"), f"is in use by process {os.getpid()}")
     lock.release()
     done = tandem("publish", "run", "--name", "early")

@@ -55,8 +55,8 @@ def test_skills_and_orchestrators_have_cards_of_their_own(registry: Registry, pu
         "evaluation/success_last_low": 0.85,
         "evaluation/success_last_high": 0.93,
     }
-    publish("pushes", spaces=spaces)
-    pushes = publish("pushes", spaces=spaces, config={"seed": 5}, metrics=numbers, parent="pushes@1")
+    first = publish("pushes", spaces=spaces)
+    pushes = publish("pushes", spaces=spaces, config={"seed": 5}, metrics=numbers, parent=first)
     head, body = parts(model_card(registry.manifest(str(skills))))
     assert "skills" in head["tags"]
     assert "model-index" not in head

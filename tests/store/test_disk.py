@@ -191,7 +191,7 @@ def test_a_run_that_vanished_while_its_disk_was_full_has_vanished_and_is_not_ask
 @pytest.fixture
 def lock(tmp_path):
     """Held by a process that runs the run ``cube``."""
-    lock = DirectoryLock(tmp_path / "cube", "")
+    lock = DirectoryLock(tmp_path / "cube")
     yield lock
     lock.release()
 

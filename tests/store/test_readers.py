@@ -28,7 +28,7 @@ class Disk:
 
     def writer(self, run_id):
         directory = self.root / run_id
-        lock, records = DirectoryLock(directory, ""), JsonlWriter(directory / "metrics.jsonl")
+        lock, records = DirectoryLock(directory), JsonlWriter(directory / "metrics.jsonl")
 
         class Writer(RunWriter):
             def metrics(self, record):

@@ -17,7 +17,7 @@ from service.envs.batch import WorldBatch
 from service.envs.observations import bob_observation, distances, each_object
 from service.envs.rules import Rules
 from service.envs.sampling import inside_fixtures
-from service.generator.validity import FALLEN_BELOW_M, Verdict, classify_goal, proposed
+from service.generator.validity import FALLEN_BELOW_M, NO_GOAL, Verdict, classify_goal, proposed
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.registry.loading import Trained
 
@@ -25,11 +25,6 @@ Mode = Literal["goals", "primitives", "alice"]
 """Bob goes to the goal; primitives act by weights that are set; Alice proposes a goal, and Bob goes there."""
 _PAUSE_S = 0.6
 """Stillness after Alice's turn and after a round, so that one sees what came out."""
-_WORDS = {
-    Verdict.NOT_MOVED: "no goal: the object hardly moved",
-    Verdict.OUTSIDE: "no goal: the object left the workspace",
-    Verdict.FALLEN: "no goal: the object fell off the table",
-}
 
 
 class Game:
@@ -234,7 +229,7 @@ class Game:
         if verdict == Verdict.VALID:
             self._pause("Alice proposed this goal", "bob")
         else:
-            self._pause(f"Alice: {_WORDS[verdict]}", "reset")
+            self._pause(f"Alice: no goal, {NO_GOAL[verdict]}", "reset")
 
     def _pause(self, caption: str, after: Literal["reset", "round", "bob"]) -> None:
         self.caption, self._after, self._still_steps = caption, after, max(round(_PAUSE_S / self.step_s), 1)
