@@ -206,7 +206,7 @@ def words(result: Mapping[str, Any]) -> str:
     """The same in a sentence, for the README."""
     return (
         f"By a model of measured costs a run gains {_until(Costs.of(result['one_box']))}; "
-        "more are for more seeds ([scaling](docs/scaling.md))."
+        "use further ones for more seeds ([scaling](docs/scaling.md))."
     )
 
 

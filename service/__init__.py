@@ -32,11 +32,11 @@ def load(
     *,
     run_task_code: bool = False,
 ) -> Trained:
-    """Load what was trained, ready to act, without torch; ``panda-cube@champion`` comes with the package.
+    """Load a trained policy, primitives or skills, ready to act without torch.
 
     Args:
         reference: NAME, NAME@ALIAS or NAME@VERSION; or the path of a run, of a checkpoint of a run, or of an
-            exported version.
+            exported version. ``panda-cube@champion`` comes with the package.
         registry: directory to look in first, by default TANDEM_REGISTRY or ``registry``; a version or alias it does not
             have is looked up among what comes with the package. Or the ``http://HOST:PORT`` of a ``tandem serve``,
             which alone is asked, with the token in TANDEM_TOKEN. What a policy of a task acts with is looked up there,
@@ -71,7 +71,7 @@ def train(
     publish: bool = False,
     on_iteration: Callable[[dict[str, float]], Ending | None] | None = None,
 ) -> Finished:
-    """Train what a recipe, a task or a file says, in this process, as ``tandem train`` does.
+    """Run a training in this process, as ``tandem train`` does, and return what came out.
 
     Args:
         what: a recipe, a task, a YAML file, or a task of yours in ``FILE.py``; None: the recipe panda-cube, or what a
@@ -82,8 +82,11 @@ def train(
         run_dir: where it keeps everything; default: ``runs/NAME``.
         registry: where it publishes, and finds what it takes; by default TANDEM_REGISTRY or ``registry``.
         resume: go on with the run there.
-        publish: publish what was learned.
+        publish: publish what was learned; the command does so by itself, but for tasks.
         on_iteration: called with the metrics of every iteration; what it returns, if anything, ends the run.
+
+    Returns:
+        Metrics of the last iteration and of the end, files that were made, and the published version, if any.
 
     Raises:
         TandemError: a setting, a file or a directory that cannot be used.
@@ -121,8 +124,12 @@ def evaluate(
         num_episodes: each from a fresh reset.
         seed: of the episodes.
 
+    Returns:
+        Success at the last step with its 95 % interval, success at any step, and the distance at the end, metres.
+
     Raises:
-        ValueError: no episodes.
+        ValueError: ``num_episodes`` below 1.
+        TandemError: no such task or goals, or a task of another number of objects.
     """
     from service.actors import evaluation
     from service.methods.task_evaluation import FINAL_SEED
@@ -143,12 +150,16 @@ def _registry() -> str:
 
 
 def make_env(task: str | Task | None = None, trained: Trained | None = None, *, num_envs: int = 1) -> TabletopVectorEnv:
-    """N worlds of a task as one Gymnasium vector environment; ``gymnasium.make`` has single ones.
+    """Make a Gymnasium vector environment of N worlds of a task; ``gymnasium.make`` has single ones.
 
     Args:
         task: by name or file, or an object; None: goals in the volume and on the table; beside a fixture on the table.
-        trained: in whose world it is; None: the paper's.
+        trained: its world is taken, with the task's settings; None: the paper's world.
         num_envs: N.
+
+    Raises:
+        TandemError: no such task, or goals that the world cannot have.
+        ValueError: ``num_envs`` below 1.
     """
     from service.envs.gym.vector import TabletopVectorEnv
 

@@ -228,8 +228,11 @@ def signature(name: str, function: Callable[..., object]) -> str:
     call = call.replace(parameters=[each for each in call.parameters.values() if each.name != "self"])
     text = f"{name}{_plain(str(call))}"
     if len(text) > 80:
-        listed = "".join(f"    {_plain(str(each))},\n" for each in call.parameters.values())
-        text = f"{name}(\n{listed}){text.rpartition(')')[2]}"
+        listed = [_plain(str(each)) for each in call.parameters.values()]
+        by_name = [each.kind is each.KEYWORD_ONLY for each in call.parameters.values()]
+        if True in by_name:
+            listed.insert(by_name.index(True), "*")
+        text = "\n".join([f"{name}(", *(f"    {each}," for each in listed), f"){text.rpartition(')')[2]}"])
     return f"```python\n{text}\n```"
 
 
@@ -249,6 +252,8 @@ def docstring(thing: object) -> str:
             items = [re.sub(r"^(\w+): ", r"`\1`: ", prose(item)) for item in re.split(r"\n(?=\S)", whole)]
             listed = prose(whole) if head == "Returns" else "\n".join(f"- {item}" for item in items)
             parts.append(f"**{head}**\n\n{listed}")
+        elif block.startswith("- "):
+            parts.append("\n".join(prose(item) for item in re.split(r"\n(?=- )", block)))
         else:
             parts.append(prose(block))
     return "\n\n".join(parts)

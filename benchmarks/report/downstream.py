@@ -196,9 +196,9 @@ def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
         rows += [own, others]
     return (
         "\n## How soon\n",
-        f"Env steps in thousands until {FINAL_SHARE:.0%} of the row's own final success is reached, which is at the "
-        "second of the first two evaluations in a row that have it on average; below it until the first method that "
-        "learns from nothing is as good. In brackets how many of them were run on the task. Mean of the seeds.\n",
+        f"Thousands of env steps until a method reaches {FINAL_SHARE:.0%} of its own final success, as the mean of two "
+        "evaluations in a row. Below each, in italics: until the first method that learns from nothing is as good. In "
+        "brackets: how many such methods were run. Means over seeds.\n",
         _markdown(rows),
     )
 

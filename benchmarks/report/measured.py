@@ -108,7 +108,7 @@ def own_task_table(trials: Mapping[str, Result]) -> str:
                 f"{percent(found['success_last_low'], 1)} to {percent(found['success_last_high'], 1)}",
             )
         )
-    head = ("method", "env steps", "minutes", "first 95 % of 100 after, minutes", "success", "95 % interval")
+    head = ("method", "env steps", "minutes", "minutes until 95 of 100 goals", "success", "95 % interval")
     return table(head, rows)
 
 

@@ -164,11 +164,11 @@ def why_alice_words(studies: Mapping[str, Mapping[str, Any]]) -> str:
         for name, study in studies.items()
     }
     return (
-        f"[Why Alice](docs/results/pretraining.md#why-alice)? Of random goals Bob solves {mean['recipe']}; "
+        f"[Why Alice](docs/results/pretraining.md#why-alice)? Bob solves {mean['recipe']} of random goals; "
         f"{mean['no-cloning']} if he clones none of her turns, "
-        f"{mean['no-difficulty']} if she is not paid when he fails."
-        f"\nIf he also plays random goals of the whole workspace: {mean['uniform']} with Alice, "
-        f"{mean['uniform-new-alice']} with an Alice who never learns, {mean['uniform-alone']} without Alice."
+        f"{mean['no-difficulty']} if his failures do not pay her."
+        f"\nWith random goals of the whole workspace added: {mean['uniform']} with Alice, "
+        f"{mean['uniform-new-alice']} with an Alice who does not learn, {mean['uniform-alone']} without Alice."
     )
 
 

@@ -34,7 +34,7 @@ class ConfigError(TandemError):
 
 
 class DivergedError(TandemError):
-    """A policy no longer acts in finite numbers; what it did before is not in doubt."""
+    """A policy's actions or losses are not finite; earlier checkpoints are valid."""
 
     exit_code = 1
 
@@ -76,7 +76,7 @@ class DamagedBlobError(RegistryError):
 
 
 class StatusError(TandemError):
-    """The service cannot be started with these options, or its URL or token is none."""
+    """The service cannot start with these options, or its URL or token is not valid."""
 
 
 class FetchError(TandemError):

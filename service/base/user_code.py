@@ -75,9 +75,9 @@ def text_of(origin: str) -> str:
     except FileNotFoundError:
         raise CodeError(f"{path.absolute()}: no such file; write FILE.py, FILE.py:NAME or MODULE:NAME") from None
     except OSError as error:
-        raise CodeError(f"{origin}: {error.strerror}; a run keeps its text") from None
+        raise CodeError(f"{origin}: {error.strerror}; name a shorter file, or one that can be read") from None
     except UnicodeDecodeError as error:
-        raise CodeError(f"{origin}: no text: {error}") from None
+        raise CodeError(f"{origin}: no UTF-8 text ({error.reason}); save it as UTF-8") from None
 
 
 def find(reference: Reference, texts: Texts, kind: Callable[[object], bool], what: str) -> Any:

@@ -37,6 +37,9 @@ def named(what: str | None, method: str | None, primitives: str | None) -> tuple
     """
     known = targets()
     if what is not None and is_task(what):
+        if method is not None and method not in TASK_METHODS and parse_reference(method) is None:
+            meant = did_you_mean(method, TASK_METHODS)
+            raise TandemError(f"--method {method}: of a task choose one of {', '.join(TASK_METHODS)}{meant}")
         if method in TASK_METHODS and method not in METHODS:
             raise TandemError(f"{method} learns nothing: measure it by tandem evaluate --task {what} --method {method}")
         chosen = {"task": what, "method": method or "ours"} | ({} if primitives is None else {"primitives": primitives})
@@ -52,6 +55,10 @@ def named(what: str | None, method: str | None, primitives: str | None) -> tuple
     if what not in known and not Path(what).suffix and not Path(what).exists():
         files = [str(file) for ending in (".py", ".yaml") if (file := Path(f"{what}{ending}")).is_file()]
         meant = f"; did you mean {' or '.join(files)}?" if files else did_you_mean(what, known)
+        if f"{DEFAULT_RECIPE}-{what}" in known:
+            meant = f"; did you mean {DEFAULT_RECIPE}-{what}?"
+        elif what in TASK_METHODS:
+            meant = f"; {what} is a method of tasks: tandem train push --method {what}"
         raise TandemError(f"{what!r}: no recipe, task or file of that name; there are {', '.join(known)}{meant}")
     if method is not None:
         raise TandemError(f"{what} says its method itself: leave out --method, or leave out {what}")

@@ -171,7 +171,7 @@ def _players(trained: Trained, method: str | None) -> dict[str, DeterministicPol
         check_fits(find_method(method), trained)
     if method != "idle":
         players[trained.label] = trained.expect_goals("tandem evaluate").player()
-    bob = trained.trained
+    bob = trained.acts_with
     if bob is not None and bob.kind == "primitives" and method is None:
         players[f"{bob.label}, Bob alone"] = bob.policy
     return players | {"idle": IdlePolicy()}

@@ -18,8 +18,8 @@ class DistillationConfig(FrozenModel):
     a teacher that cheats (Chen et al. 2019).
     """
 
-    num_worlds: int = Field(240, ge=1)
-    episode_steps: int = Field(50, ge=2)
+    num_worlds: int = Field(240, ge=1, description="worlds stepped together")
+    episode_steps: int = Field(50, ge=2, description="env steps of an episode")
     random_fraction: float = Field(
         0.3,
         ge=0.0,
@@ -31,7 +31,7 @@ class DistillationConfig(FrozenModel):
         0.3, ge=0.0, le=1.0, description="std of noise on every second action of a world: it leaves the usual path"
     )
     gradient_steps: int = Field(40, ge=1, description="after an episode of every world")
-    batch_size: int = Field(1024, ge=1)
+    batch_size: int = Field(1024, ge=1, description="steps of a gradient step")
     learning_rate: float = Field(1e-3, gt=0.0, description="falls to a fiftieth, linearly")
     ema_decay: float = Field(
         0.9, ge=0.0, lt=1.0, description="what is evaluated and published is a moving average over iterations"
@@ -42,7 +42,7 @@ class DistillationConfig(FrozenModel):
 
 
 class DistillingConfig(Config):
-    """Distillation: Bob learns from the one of ``--from``, who sees what a robot does not."""
+    """Distillation: a student Bob learns from the Bob of --from, who observes without delay and noise."""
 
     made_in: ClassVar[str] = "service.methods.distillation"
     makes: ClassVar[Literal["primitives"]] = "primitives"

@@ -30,6 +30,7 @@ _WANTED = {
     "model_type": "give a group of keys, such as {KEY: VALUE}",
     "model_attributes_type": "give a group of keys, such as {KEY: VALUE}",
     "dict_type": "give a group of keys, such as {KEY: VALUE}",
+    "missing": "is missing, and has no default",
 }
 """What to do about the types of errors whose own words are Python's."""
 
@@ -43,9 +44,13 @@ def first_of(error: ValidationError) -> Any:
 def first_error(error: ValidationError) -> str:
     """The first thing that is wrong with plain values, in a few words."""
     first = first_of(error)
-    key = ".".join(str(part) for part in first["loc"] if part not in NO_KEYS) or "the top level"
+    key = ".".join(str(part) for part in first["loc"] if part not in NO_KEYS)
     if first["type"] == "extra_forbidden":
         return f"unknown key {key!r}"
     found = "" if isinstance(first["input"], dict) else f" = {first['input']!r}"  # a whole group says nothing
     words = _WANTED.get(first["type"], first["msg"].removeprefix("Value error, "))  # which our own checks have
-    return f"{key}{found}: {words}"
+    if first["type"] == "literal_error" and {BUILT_IN, NAMED} & {*first["loc"]}:
+        words += ", or describe one: {KEY: VALUE}"
+    if not key and first["type"] == "value_error":  # our own checks of what belongs together name the keys
+        return str(words)
+    return f"{key or 'the top level'}{found}: {words}"

@@ -40,14 +40,14 @@ class PadConfig(FrozenModel):
     """A capsule that a finger holds things with."""
 
     start_m: Vector = Field(description="one end of its axis, in the frame of the finger's body")
-    end_m: Vector
-    radius_m: float = Field(gt=0.0)
+    end_m: Vector = Field(description="its other end, in the frame of the body")
+    radius_m: float = Field(gt=0.0, description="of its round ends")
 
 
 class FingerConfig(FrozenModel):
     """A finger that one joint moves; what hangs on it moves along."""
 
-    joint: str
+    joint: str = Field(description="name of the joint that moves it")
     closed: float = Field(description="value of the joint where the gripper is closed, rad or m")
     open: float = Field(description="where it is open")
     side: Literal["left", "right", "both"] = Field(
@@ -109,9 +109,9 @@ class RobotConfig(FrozenModel):
     max_force: Numbers = Field(100.0, description="of the same, N m or N")
     armature: Numbers | None = Field(None, description="inertia of the motors, kg m2 or kg; None: the model's")
     friction_loss: Numbers | None = Field(None, description="dry friction of the joints, N m or N; None: the model's")
-    finger_stiffness: Numbers = 1000.0
-    finger_damping: Numbers = 25.0
-    finger_max_force: Numbers = 40.0
+    finger_stiffness: Numbers = Field(1000.0, description="N/m, or Nm/rad of a hinge")
+    finger_damping: Numbers = Field(25.0, description="Ns/m, or Nms/rad of a hinge")
+    finger_max_force: Numbers = Field(40.0, description="N, or Nm of a hinge")
     finger_armature: Numbers | None = None
     finger_friction_loss: Numbers | None = None
     touching: tuple[str, ...] = Field(

@@ -24,11 +24,15 @@ class RunConfig(FrozenModel):
 
     total_env_steps: int = Field(3_000_000, ge=1, description="of self-play: both players' steps together")
     checkpoint_interval: int = Field(20, ge=1, description="iterations between two checkpoints")
-    keep_checkpoints: int = Field(3, ge=1)
+    keep_checkpoints: int = Field(3, ge=1, description="the newest, which are kept")
     evaluation_interval: int = Field(20, ge=0, description="iterations between two evaluations; 0: never")
-    evaluation_episodes: int = Field(100, ge=1)
+    evaluation_episodes: int = Field(
+        100, ge=1, description="of each evaluation on the way; skill discovery measures coverage"
+    )
     final_episodes: int = Field(300, ge=1, description="of the evaluation at the end; paper: 16, likely")
-    evaluation_steps: int = Field(50, ge=1)
+    evaluation_steps: int = Field(
+        50, ge=1, description="env steps of an episode of evaluation, 40 ms each; a task has its own"
+    )
     num_threads: int = Field(
         0,
         ge=0,
@@ -37,10 +41,10 @@ class RunConfig(FrozenModel):
 
 
 class Config(FrozenModel):
-    """A run: the keys that all methods have. A method's own class adds its keys, and makes it."""
+    """The configuration of a run: the keys of all methods. The class of a method derives from it and adds its own."""
 
     name: str = Field("panda-cube", pattern=f"^{NAME}$", description="registry name of what it makes")
-    seed: int = Field(0, ge=0, le=2**32 - 1)
+    seed: int = Field(0, ge=0, le=2**32 - 1, description="all random numbers follow from it")
     method: str = Field(
         description="a name of ``tandem methods``; or FILE.py, FILE.py:CLASS or MODULE:CLASS, a class of yours"
     )
@@ -57,7 +61,7 @@ class Config(FrozenModel):
     part: ClassVar[str] = "policy"
     """The component of the method's state that is published."""
     resumable: ClassVar[tuple[str, ...]] = ("run.",)
-    """Beginnings of ``--set`` that a resumed run may change: nothing that its past would have to be made again for."""
+    """Beginnings of the keys that a resumed run may change, as none of them changes what is already done."""
 
     @property
     def directory_name(self) -> str:
@@ -89,7 +93,7 @@ class Config(FrozenModel):
         return exact
 
     def as_in(self, saved: Self) -> Self:
-        """The same, with what ``begin`` said exactly in a saved configuration that may have begun as this one."""
+        """Return a copy with the exact values that ``begin`` recorded in a saved configuration."""
         return self
 
     def check_here(self) -> None:

@@ -104,7 +104,7 @@ class GeneratorConfig(FrozenModel):
     past_opponent_fraction: float = Field(
         0.2, ge=0.0, le=0.5, description="share of worlds, each way (OpenAI 2021: 20 %)"
     )
-    opponent_pool_size: int = Field(5, ge=1)
+    opponent_pool_size: int = Field(5, ge=1, description="past players that are kept")
     opponent_interval: int = Field(10, ge=1, description="iterations between two snapshots of the players")
     goal_source: str = Field(
         "alice",
@@ -125,7 +125,7 @@ class GeneratorConfig(FrozenModel):
     replay_from_reset: bool = Field(
         False, description="replayed goals also start where games do, when Bob can learn from that"
     )
-    replay_buffer_size: int = Field(4096, ge=1)
+    replay_buffer_size: int = Field(4096, ge=1, description="goals of Alice that are kept")
     cell_size_m: float = Field(CELL_SIZE_M, gt=0.0, description="edge of a goal cell of the difficulty grid")
     novelty_window: int = Field(50, ge=1, description="iterations without a new cell before the run may stop")
     stop_success_rate: float = Field(
@@ -136,7 +136,7 @@ class GeneratorConfig(FrozenModel):
 class MLPConfig(FrozenModel):
     """A multi-layer perceptron with ELU."""
 
-    hidden_sizes: tuple[PositiveInt, ...] = Field((256, 256), min_length=1)
+    hidden_sizes: tuple[PositiveInt, ...] = Field((256, 256), min_length=1, description="units of each layer")
 
 
 class MCPConfig(FrozenModel):
@@ -145,7 +145,7 @@ class MCPConfig(FrozenModel):
     num_primitives: int = Field(4, ge=1, description="K; paper: 4")
     trunk_hidden_sizes: tuple[PositiveInt, ...] = Field((256,), min_length=1, description="shared by the primitives")
     primitive_hidden_size: int = Field(128, ge=1, description="one hidden layer of each primitive's own")
-    gate_hidden_sizes: tuple[PositiveInt, ...] = Field((256, 256), min_length=1)
+    gate_hidden_sizes: tuple[PositiveInt, ...] = Field((256, 256), min_length=1, description="units of each layer")
     weight_floor: float = Field(0.01, gt=0.0, lt=1.0, description="least gate weight, bounds the composite variance")
     log_std_min: float = Field(-2.0, description="of a primitive")
     log_std_max: float = Field(0.5, description="of a primitive")
@@ -161,8 +161,8 @@ class PolicyConfig(FrozenModel):
     """Networks of both players."""
 
     alice: MLPConfig = MLPConfig()
-    alice_log_std_min: float = -2.5
-    alice_log_std_max: float = 0.5
+    alice_log_std_min: float = Field(-2.5, description="least log of the std of her actions")
+    alice_log_std_max: float = Field(0.5, description="greatest log of the std of her actions")
     bob: MCPConfig = MCPConfig()
     monolithic_bob: MLPConfig | None = Field(
         None, description="a Bob of one Gaussian network instead of primitives: an ablation, nothing to publish"
@@ -181,18 +181,18 @@ class PolicyConfig(FrozenModel):
 class PPOConfig(FrozenModel):
     """One player's PPO (Schulman et al. 2017)."""
 
-    learning_rate: float = Field(3e-4, gt=0.0)
-    gamma: float = Field(0.99, gt=0.0, le=1.0)
-    gae_lambda: float = Field(0.95, ge=0.0, le=1.0)
-    clip: float = Field(0.2, gt=0.0, lt=1.0)
+    learning_rate: float = Field(3e-4, gt=0.0, description="of Adam, at the start; it follows target_kl")
+    gamma: float = Field(0.99, gt=0.0, le=1.0, description="discount of a step")
+    gae_lambda: float = Field(0.95, ge=0.0, le=1.0, description="lambda of generalised advantage estimation")
+    clip: float = Field(0.2, gt=0.0, lt=1.0, description="epsilon: the ratio of the surrogate is clipped to 1 +- this")
     decoupled: bool = Field(
         True, description="clip around the policy at the start of the update rather than the one that acted"
     )
     dual_clip: float = Field(3.0, gt=1.0, description="bound of the surrogate for negative advantages (Ye et al. 2020)")
-    entropy_weight: float = Field(0.001, ge=0.0)
-    num_epochs: int = Field(3, ge=1)
-    minibatch_size: int = Field(3200, ge=2)
-    max_grad_norm: float = Field(0.5, gt=0.0)
+    entropy_weight: float = Field(0.001, ge=0.0, description="of the entropy bonus in the loss")
+    num_epochs: int = Field(3, ge=1, description="passes over the samples in an update")
+    minibatch_size: int = Field(3200, ge=2, description="samples of a gradient step")
+    max_grad_norm: float = Field(0.5, gt=0.0, description="longer gradients are shortened to this")
     target_kl: float = Field(0.02, gt=0.0, description="an update stops early once its mean KL passes 1.5 x this")
     value_first_updates: int = Field(
         0,

@@ -31,11 +31,11 @@ SKILLS_OF: Mapping[str, tuple[Prior, ZeroShot]] = {
 class SACConfig(FrozenModel):
     """Soft actor-critic on many worlds: every world makes a step, then there are several large updates."""
 
-    num_worlds: int = Field(64, ge=1)
+    num_worlds: int = Field(64, ge=1, description="worlds stepped together")
     gradient_steps: int = Field(
         8, ge=1, description="updates after a step of every world; 16 learn no more (docs/results)"
     )
-    batch_size: int = Field(256, ge=1)
+    batch_size: int = Field(256, ge=1, description="transitions of an update")
     learning_rate: float = Field(1e-3, gt=0.0, description="rl-zoo for Panda and Fetch")
     gamma: float = Field(0.95, gt=0.0, lt=1.0, description="rl-zoo; a horizon of 20 of the 50 steps")
     tau: float = Field(0.05, gt=0.0, le=1.0, description="rl-zoo")
@@ -60,9 +60,9 @@ class SkillsSACConfig(SACConfig):
     gradient_steps: int = Field(
         4, ge=1, description="updates after a step of every world: 1 for 16 env steps; METRA: 1 for 4 to 32"
     )
-    learning_rate: float = Field(3e-4, gt=0.0)
-    gamma: float = Field(0.98, gt=0.0, lt=1.0)
-    tau: float = Field(0.005, gt=0.0, le=1.0)
+    learning_rate: float = Field(3e-4, gt=0.0, description="of Adam")
+    gamma: float = Field(0.98, gt=0.0, lt=1.0, description="discount of a step")
+    tau: float = Field(0.005, gt=0.0, le=1.0, description="share by which target critics follow in an update")
     initial_entropy_coefficient: float = Field(0.01, gt=0.0, description="LSD's and METRA's code")
     target_entropy: float = Field(-0.5, description="for each action; METRA's code")
     critic_layer_norm: bool = Field(False, description="none has it")
@@ -83,7 +83,7 @@ class SkillsConfig(FrozenModel):
     )
     learning_rate: float = Field(3e-4, gt=0.0, description="of that network; LSD's code 3e-5, METRA's 1e-4, DADS' 3e-4")
     gradient_steps: int = Field(2, ge=1, description="of that network after a step of every world")
-    batch_size: int = Field(256, ge=2)
+    batch_size: int = Field(256, ge=2, description="transitions of an update of that network")
     newest_steps: int = Field(
         1_000_000,
         ge=1,

@@ -58,29 +58,32 @@ def _zero_shot_method(name: str) -> TaskMethod:
 TASK_METHODS: Mapping[str, TaskMethod] = {
     "ours": TaskMethod("ours", "SAC sets the weights of the frozen primitives", "primitives"),
     "ours-her": TaskMethod(
-        "ours + HER", "the same, with relabelled goals, fewer and fewer", "primitives", her_ratio=(_HER_SHARE, 0.0)
+        "ours + HER",
+        "SAC sets the weights of the frozen primitives, with hindsight that fades out",
+        "primitives",
+        her_ratio=(_HER_SHARE, 0.0),
     ),
     "ours-residual-her": TaskMethod(
         "ours + residual + HER",
-        "and adds a small action of its own",
+        "as ours-her, and adds a small action of its own",
         "primitives",
         her_ratio=(_HER_SHARE, 0.0),
         adds_action=True,
     ),
     "asp-only": TaskMethod("ASP only", "Bob as he is", "primitives", learns=False),
     "scratch-monolithic-her": TaskMethod(
-        "scratch monolithic + HER", "SAC alone, with relabelled goals", her_ratio=(_HER_SHARE, _HER_SHARE)
+        "scratch monolithic + HER", "SAC alone, with hindsight", her_ratio=(_HER_SHARE, _HER_SHARE)
     ),
     "scratch-mcp-her": TaskMethod(
         "scratch MCP + HER",
-        "primitives and gate learned together, with relabelled goals",
+        "primitives and gate learned together by SAC, with hindsight",
         mcp_actor=True,
         her_ratio=(_HER_SHARE, _HER_SHARE),
     ),
     "scratch-monolithic": TaskMethod("scratch monolithic", "SAC alone"),
     "scratch-mcp": TaskMethod("scratch MCP", "primitives and gate learned together by SAC", mcp_actor=True),
     **{name: _skill_method(name) for name in SKILLS_OF},
-    "any-skills": TaskMethod("skills", "SAC sets the skill vector, whoever's they are", "skills"),
+    "any-skills": TaskMethod("skills", "SAC sets the skill vector of any skills", "skills"),
     **{f"{name}-zero-shot": _zero_shot_method(name) for name, (_, leads) in SKILLS_OF.items() if leads == "way"},
     "idle": TaskMethod("idle", "does nothing", learns=False),
 }

@@ -47,7 +47,7 @@ class WorkspaceConfig(FrozenModel):
     """The box in which goals are valid. Origin of the world: the table top, before the robot's base (Panda: 0.6 m)."""
 
     center_x_m: float = Field(-0.05, ge=-0.3, le=0.2, description="-0.05 keeps the downstream Larger task reachable")
-    center_y_m: float = Field(0.0, ge=-0.3, le=0.3)
+    center_y_m: float = Field(0.0, ge=-0.3, le=0.3, description="its middle, to the left of the robot")
     length_x_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
     length_y_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
     height_m: float = Field(0.35, gt=0.0, le=0.8, description="paper: 35 cm")
@@ -158,7 +158,7 @@ class WorldConfig(FrozenModel):
     object_size_m: float = Field(
         0.05, ge=0.02, le=0.07, description="cube edge or sphere diameter; paper: 5 cm. A description has its own"
     )
-    object_mass_kg: float = Field(0.1, gt=0.0, le=5.0)
+    object_mass_kg: float = Field(0.1, gt=0.0, le=5.0, description="mass of an object without its own")
     friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of the object, also on the table")
     pad_friction: float = Field(1.0, gt=0.0, le=3.0, description="sliding friction of the fingertips on the object")
     gripper: Literal["free", "blocked"] = Field("free", description="blocked: held closed, whatever the action says")
@@ -182,7 +182,7 @@ class WorldConfig(FrozenModel):
         le=0.4,
         description="end effector at reset, above the workspace's centre; low, so that chance finds the object",
     )
-    physics_step_s: float = Field(0.002, gt=0.0, le=0.01)
+    physics_step_s: float = Field(0.002, gt=0.0, le=0.01, description="time of one step of the physics")
     num_substeps: int = Field(20, ge=1, le=200, description="physics steps per action; 20 x 2 ms = 25 Hz as panda-gym")
 
     @model_validator(mode="before")

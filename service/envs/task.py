@@ -29,7 +29,7 @@ EPISODE_STEPS = 50
 
 @dataclass(frozen=True, slots=True)
 class Bodies:
-    """Objects of N worlds; ``bodies[:, k]`` are those of one place in each."""
+    """Places and velocities of the K objects of N worlds; ``bodies[:, k]`` has those of object k."""
 
     place: StateArray
     """(N, K, 3) centres, metres."""
@@ -37,7 +37,7 @@ class Bodies:
     """(N, K, 3) m/s."""
 
     def __getitem__(self, key: Any) -> Bodies:
-        """Some of them."""
+        """Select worlds, or objects."""
         known = not isinstance(self.velocity, _NotGiven)
         return Bodies(self.place[key], self.velocity[key] if known else self.velocity)
 
@@ -62,11 +62,11 @@ class View:
     """(N, M) what ``remember`` gave last; 0 when an episode begins."""
 
     def of(self, worlds: BoolArray | slice) -> View:
-        """The same of some worlds."""
+        """Select worlds by a (N,) mask or a slice."""
         return View(*(getattr(self, each.name)[worlds] for each in fields(self)))
 
     def rows(self) -> FloatArray:
-        """(N, V) its numbers without goal and memory, to be kept in a replay buffer; ``of_rows`` reads them."""
+        """Copy the numbers but goal and memory as (N, V) float32 for a replay buffer; ``of_rows`` reads them."""
         parts = self.objects.place, self.objects.velocity, self.gripper, self.fingers, self.contacts, self.elapsed
         rows: FloatArray = np.concatenate(
             [each.reshape(len(self.elapsed), -1) for each in parts], axis=1, dtype=np.float32
@@ -75,7 +75,7 @@ class View:
 
     @classmethod
     def of_rows(cls, rows: FloatArray, goal: FloatArray) -> View:
-        """The view that (N, V) rows were, with (N, K, 3) goals and without memory."""
+        """Make a view of (N, V) rows, with (N, K, 3) goals and without memory."""
         num, many = goal.shape[:2]
         place, velocity, gripper, fingers, contacts, elapsed = np.split(
             rows.astype(np.float64), np.cumsum([3 * many, 3 * many, 3, 1, 2 * many]), axis=1
@@ -97,7 +97,7 @@ Function = Callable[[View], Any]
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What is asked for in a world, which differs from the one that primitives were trained in.
+    """A task: settings of the world, starts, goals, success and reward.
 
     Functions get a ``View`` of N worlds and give an array with a row for each; any NumPy will do.
 
@@ -130,11 +130,11 @@ class Task:
     version: int = 1  # 0: other contacts (docs/decisions/0010), and Box with another rule of success (0007)
     """Version in its Gymnasium name; results of different ones are not compared."""
     name: str = ""
-    """By which commands know it; ``find_task`` says it."""
+    """Name in commands; ``find_task`` sets it."""
     code: Mapping[str, str] = field(default_factory=dict)
-    """Text of the file that it is from, if that is not ours; ``find_task`` says it."""
+    """Text of the file of a user's task; ``find_task`` sets it."""
     closed: str = ""
-    """Why its functions may not be run; then they are None."""
+    """Why its functions are left out; empty where they may run."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.world, Mapping):
@@ -164,12 +164,12 @@ class Task:
 
     @property
     def is_own(self) -> bool:
-        """Whether success or reward are the user's."""
+        """Whether it has a success or a reward of its own."""
         return self.success is not None or self.reward is not None
 
     @property
     def goal_kind(self) -> GoalKind:
-        """Random goals of ours that come nearest: where no function is asked."""
+        """Kind of its random goals; ``mixed`` where ``goals`` is a function."""
         return self.goals if isinstance(self.goals, str) else "mixed"
 
     def world_from(self, world: WorldConfig) -> WorldConfig:
@@ -204,7 +204,7 @@ class _NotGiven(NDArrayOperatorsMixin):
         self._part = part
 
     def _refuse(self, *_: Any, **__: Any) -> Any:
-        raise LookupError(f"{self._part} is not known here")
+        raise LookupError(f"{self._part} is not known where a reward is computed again, for another goal")
 
     __getitem__ = __array__ = __array_ufunc__ = __len__ = __bool__ = _refuse
 

@@ -74,7 +74,7 @@ def describe(
         networks: by the names of their files, with the differences that the parity test found.
         measured: in its world.
     """
-    world, frozen = trained.world, trained.trained
+    world, frozen = trained.world, trained.acts_with
     robot, seen = described(world), layouts(world)
     parts = {"policy": trained} if frozen is None else {"orchestrator": trained, "primitives": frozen}
     widest_m = robot.opening_m if world.gripper == "free" else 0.0

@@ -85,11 +85,11 @@ def networks_of(trained: Trained, part: str) -> list[Network]:
     trained.expect("primitives", "orchestrator", by="tandem export")
     frozen = trained
     if trained.kind == "orchestrator":
-        if trained.trained is None or trained.trained.kind != "primitives":
+        if trained.acts_with is None or trained.acts_with.kind != "primitives":
             raise TandemError(
                 f"{trained.label} was trained with a method that composes no primitives: export one of ours"
             )
-        frozen = trained.trained
+        frozen = trained.acts_with
     networks = []
     if part != "primitives":
         networks.append(network_of_bob(trained) if frozen is trained else network_of_orchestrator(trained))

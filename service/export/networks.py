@@ -87,7 +87,7 @@ def network_of_orchestrator(learned: Trained) -> Network:
     Raises:
         TandemError: the primitives are none.
     """
-    policy, actor_parameters, trained = learned.primitives, learned.parameters, learned.trained
+    policy, actor_parameters, trained = learned.primitives, learned.parameters, learned.acts_with
     assert trained is not None
     seen = layouts(trained.config.world)
     actor = numpy_actor(actor_parameters)

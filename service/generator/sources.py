@@ -34,10 +34,14 @@ class Known:
     success_rate: float
     """Bob's, mean over all cells; 0 where no goal was proposed or tried."""
     near: Callable[[StateArray], BoolArray]
-    """Whether (M, 3 K) goals are in cells to which their objects were brought in a game, or beside one: (M,)."""
+    """(M,) whether (M, K, 3) or (M, 3 K) goals, metres, are in cells to which objects were brought, or beside one."""
 
     def random(self, rng: np.random.Generator, num: int = NUM_DRAWN, kind: GoalKind = "mixed") -> StateArray:
-        """(num, 3 K) goals as those of an evaluation, but ``one``, metres."""
+        """Draw (num, 3 K) goals of a kind as an evaluation does, metres.
+
+        Raises:
+            TandemError: ``one``, or a kind that the world cannot have.
+        """
         check_goals(kind, self.world)
         if kind == "one":
             raise TandemError("goals = 'one' depend on where the objects are; choose mixed, and let the others stay")
@@ -98,7 +102,8 @@ class CheckedSource:
         where = f"{self._origin}: {self._name}.weights"
         weight = checked(where, weight, learnability.shape)
         if (weight < 0.0).any():
-            raise CodeError(f"{where} gave numbers below 0; give others")
+            least = int(weight.argmin())
+            raise CodeError(f"{where} gave {weight[least]:g} at [{least}]; give weights of 0 or more")
         return weight
 
 

@@ -99,7 +99,7 @@ class _ComposingWrapper:
         return gymnasium.spaces.Box(-1.0, 1.0, (self._num_actions,), np.float32)
 
     def reset(self, *, seed: Any = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Reset what is wrapped."""
+        """Reset the environment."""
         observation, info = self.env.reset(seed=seed, options=options)
         return self._observe(observation), info
 
@@ -197,5 +197,5 @@ class ComposePrimitivesVector(_ComposingWrapper, gymnasium.vector.VectorWrapper[
         return self.env.state()
 
     def restore(self, state: Any) -> Any:
-        """Go back to a saved state; the observation there."""
+        """Go back to a saved state, and return the observation there."""
         return self._observe(self.env.restore(state))

@@ -22,7 +22,9 @@ from service.policies.adam import Adam, copied, put_back
 
 
 class IntrinsicReward:
-    """A reward that a network makes out of transitions and skills: a base for ``loss`` and ``paid`` of a method.
+    """The base class of intrinsic rewards, which a network computes from transitions and skills.
+
+    A method has its own ``loss`` or ``paid``.
 
     Args:
         config: of the method.
@@ -82,11 +84,11 @@ class IntrinsicReward:
         return make_layers(self.state_size, *self.config.hidden_sizes, self.config.size)
 
     def loss(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
-        """What the network is to make small, of a batch."""
+        """Scalar loss of the network on (B, S) states before and after, and (B, Z) skills."""
         return -self.paid(before, after, skill).mean()
 
     def paid(self, before: Tensor, after: Tensor, skill: Tensor) -> Tensor:
-        """(B,) what transitions are worth: the way in phi along the skill, as LSD and METRA pay it."""
+        """(B,) rewards (phi(s') - phi(s)) . z, as of LSD and METRA; (B, Z) with ``pays_features``."""
         return along(self.network(after) - self.network(before), skill)
 
     def learned(self) -> dict[str, Tensor]:
@@ -100,5 +102,5 @@ class IntrinsicReward:
 
 
 def along(step: Tensor, skill: Tensor) -> Tensor:
-    """(B,) length of (B, Z) steps in phi along (B, Z) skills, times the skills' own."""
+    """(B,) dot products of (B, Z) steps in phi and (B, Z) skills."""
     return (step * skill).sum(dim=1)

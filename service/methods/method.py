@@ -41,9 +41,10 @@ class StateLostError(WorkersError):
 
 @dataclass(frozen=True, slots=True)
 class Iteration:
-    """What an iteration that has ended leaves behind."""
+    """Results of an iteration that has ended."""
 
     metrics: Metrics
+    """By name, such as ``bob/success_rate``; ``iteration`` and ``env_steps`` among them."""
     goals: StateArray | None = None
     """(M, 7) a sample of its goals: start x y z, goal x y z (metres), solved 0/1; None for a method without goals."""
     diverged: Mapping[str, Diverged] = field(default_factory=dict)
@@ -89,7 +90,7 @@ class Timing:
 
 
 class Method(ABC):
-    """What a run trains.
+    """The base class of what learns in a run.
 
     Call order: ``start`` once; then ``step`` again and again, with ``evaluate``, ``state`` and the others in between;
     ``close`` at the end. A method that continues from what ``state`` gave learns what it would have learned without
@@ -113,7 +114,7 @@ class Method(ABC):
         return "begin another run with a lower learning rate"
 
     def measure(self) -> Metrics:
-        """Measure at the end what has been learned, on goals that chose nothing."""
+        """Measure the final result, on goals that were used for nothing else."""
         return {}
 
     def start(self, state: State | None = None) -> None:
@@ -171,7 +172,7 @@ class Method(ABC):
         """End what it started; a second call does nothing."""
 
     def count(self, num_env_steps: int) -> dict[str, float]:
-        """Count an iteration and its env steps; the first of its metrics."""
+        """Count an iteration and its env steps, and return both as metrics."""
         self.iteration += 1
         self.num_env_steps += num_env_steps
         return {"iteration": self.iteration, "env_steps": self.num_env_steps}

@@ -80,7 +80,7 @@ class FrozenSkills:
         return draw_skills(self.prior, num, self.size, rng)
 
     def from_action(self, actions: FloatArray) -> FloatArray:
-        """(N, Z) skills that (N, Z) actions in [-1, 1] of an orchestrator mean.
+        """Convert (N, Z) actions in [-1, 1] of an orchestrator to (N, Z) skills.
 
         Of N(0, I) up to 1.5 standard deviations, as in CSF's code; on the unit sphere their direction; else they
         themselves.
@@ -114,10 +114,11 @@ class FrozenSkills:
     def towards(self, positions: FloatArray, goal: FloatArray) -> FloatArray:
         """(N, Z) skills that lead to (N, 3) goals, metres, without learning: zero-shot.
 
-        LSD, METRA, CSF: the direction from phi(s) to phi(g), as long as skills are on average. DIAYN: what tells g.
+        LSD, METRA, CSF: the direction from phi(s) to phi(g), as long as skills are on average. DIAYN: the network's
+        outputs at g.
 
         Raises:
-            TandemError: the method, such as DADS, says nothing of the kind.
+            TandemError: the method, such as DADS, has no skill for a goal.
         """
         there = normalised_place(goal)
         if self.zero_shot == "place":

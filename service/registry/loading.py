@@ -56,7 +56,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Trained:
-    """What was trained, ready to act, with what it was trained with.
+    """A trained policy, primitives or skills, ready to act, with configuration and manifest.
 
     Policies of tasks and skills keep the step before: call ``begin`` before new episodes.
     """
@@ -83,12 +83,12 @@ class Trained:
     """The task that it plays."""
     method: str | None = None
     """Name of the method that learned a policy of a task, such as ``ours-her``."""
-    trained: Trained | None = None
+    acts_with: Trained | None = None
     """The primitives or skills that a policy of a task acts with, if any."""
 
     @property
     def name(self) -> str:
-        """What it is called elsewhere, where paths of this machine mean nothing."""
+        """Name without a path of this machine, for manifests and model cards."""
         if self.manifest is not None:
             return self.manifest.reference
         if self.kind == "orchestrator" or self.path is None:
@@ -122,20 +122,20 @@ class Trained:
 
     @property
     def nominal(self) -> Trained:
-        """The same in one world, where it was trained in worlds that are drawn."""
+        """The same in the world without ``world.randomisation``."""
         return replace(self, config=self.config.model_copy(update={"world": self.config.world.nominal}))
 
     @property
     def tried_on(self) -> Task:
-        """Its task, or the random goals that it is tried on."""
+        """The task that it is evaluated on: its own, or random goals."""
         return self.task or Task("Goals", goals=self.config.world.usual_goals)
 
     @property
     def goal_kind(self) -> GoalKind:
-        """Random goals that it is tried on, where success is to be within a distance of them.
+        """Kind of the random goals that it is evaluated on, where success is to be within a distance of them.
 
         Raises:
-            TandemError: its task says otherwise.
+            TandemError: its task has starts, goals, success or reward of its own.
         """
         task = self.tried_on
         if task.closed or task.is_own or task.starts or not isinstance(task.goals, str):
@@ -145,7 +145,7 @@ class Trained:
         return task.goals
 
     def on_goals(self, kind: GoalKind | None) -> Task:
-        """What it is tried on, with random goals of that kind; None: as it is."""
+        """The task that it is evaluated on, with random goals of that kind; None: with its own."""
         return self.tried_on if kind is None else replace(self.tried_on, goals=kind)
 
     @property
@@ -165,11 +165,11 @@ class Trained:
         Raises:
             TandemError: it has none.
         """
-        if self.trained is not None:
-            return self.trained.primitives
+        if self.acts_with is not None:
+            return self.acts_with.primitives
         if not isinstance(self.policy, NumpyMCPPolicy):
             why = "trained with policy.monolithic_bob" if self.kind == "primitives" else self._what
-            raise TandemError(f"{self.label} has no primitives: it is {why}")
+            raise TandemError(f"{self.label} has no primitives: it is {why}; load some, such as panda-cube@champion")
         return self.policy
 
     @property
@@ -179,10 +179,12 @@ class Trained:
         Raises:
             TandemError: it has none.
         """
-        if self.trained is not None:
-            return self.trained.skills
+        if self.acts_with is not None:
+            return self.acts_with.skills
         if not isinstance(self.policy, ZeroShotPolicy):
-            raise TandemError(f"{self.label} has no skills: it is {self._what}")
+            raise TandemError(
+                f"{self.label} has no skills: it is {self._what}; load what a method of skill discovery learned"
+            )
         return self.policy.skills
 
     @property
@@ -191,7 +193,7 @@ class Trained:
         policy = self.skills if self.kind == "skills" else self.policy
         if isinstance(policy, NumpyPolicy | FrozenSkills):
             return parameters_digest(policy)
-        return digest_of(self.trained.digest if self.trained is not None else "", self.parameters)
+        return digest_of(self.acts_with.digest if self.acts_with is not None else "", self.parameters)
 
     def begin(self) -> None:
         """Forget the last step: new episodes begin."""
@@ -200,10 +202,10 @@ class Trained:
             begin()
 
     def act_deterministic(self, observation: FloatArray) -> FloatArray:
-        """(N, O) positions and goal, such as (N, 14), to actions (N, 4).
+        """Compute (N, 4) actions from (N, O) positions and goal, such as (N, 14), metres. Bob takes (O,), too.
 
         Raises:
-            PolicyError: another shape, or another N than in the step before.
+            PolicyError: another shape; of a policy of a task another N than in the step before, without ``begin``.
         """
         return self.policy.act_deterministic(observation)
 
@@ -213,7 +215,7 @@ class Trained:
         return self.policy
 
     def on(self, task: str | None) -> Trained:
-        """The same on a task, by its name or file, without Alice; None: as it is.
+        """Return a copy that plays a task, by its name or file, without Alice; None: itself.
 
         Raises:
             TandemError: no such task, or one of more or fewer objects.
@@ -221,7 +223,7 @@ class Trained:
         return self if task is None else self.playing(find_task(task))
 
     def playing(self, task: Task) -> Trained:
-        """The same on a task, without Alice.
+        """Return a copy that plays a task, without Alice.
 
         Raises:
             TandemError: the task has more or fewer objects, or lets policies see something else.
@@ -240,10 +242,10 @@ class Trained:
         return replace(self, task=task, alice=None)
 
     def expect(self, *kinds: Kind, by: str) -> Trained:
-        """Itself, if it is of one of these kinds.
+        """Return itself, if it is of one of these kinds.
 
         Args:
-            kinds: that mean something there.
+            kinds: that will do.
             by: what needs them, such as ``tandem coverage``.
 
         Raises:
@@ -252,11 +254,15 @@ class Trained:
         if self.kind in kinds:
             return self
         wanted = " or ".join("a policy of a task" if kind == "orchestrator" else kind for kind in kinds)
-        hint = f": name {self.trained.name}, which it acts with" if self.trained and self.trained.kind in kinds else ""
+        hint = (
+            f": name {self.acts_with.name}, which it acts with"
+            if self.acts_with and self.acts_with.kind in kinds
+            else ""
+        )
         raise TandemError(f"{self.label} is {self._what}; {by} needs {wanted}{hint}")
 
     def expect_goals(self, by: str) -> Trained:
-        """Itself, if it can be sent to goals.
+        """Return itself, if it can be sent to goals.
 
         Raises:
             TandemError: it cannot; see ``expect``.
@@ -300,8 +306,8 @@ def load(
             f"{reference}: no such directory of a run, training or exported version; for published versions write "
             "NAME@ALIAS"
         )
-    if primitives is not None and found.trained is None:
-        raise TandemError(f"{found.label} acts with no others: leave out primitives {primitives}")
+    if primitives is not None and found.acts_with is None:
+        raise TandemError(f"{found.label} acts with nothing else: leave out primitives {primitives!r}")
     return found
 
 
@@ -348,10 +354,10 @@ def _load_version(reference: str, registry: Path | str, primitives: str | None, 
             }
         except KeyError as error:
             raise TandemError(f"{label}: its manifest lacks {error}; publish it again") from None
-        trained = _find_frozen(label, name, digest, (registry, primitives))
-        policy = learned_policy(parameters, trained, trained.config, hold_steps)
+        acts_with = _find_frozen(label, name, digest, (registry, primitives))
+        policy = learned_policy(parameters, acts_with, acts_with.config, hold_steps)
         return Trained(
-            label, "orchestrator", trained.config, policy, parameters, manifest, path, trained=trained, **about
+            label, "orchestrator", acts_with.config, policy, parameters, manifest, path, acts_with=acts_with, **about
         )
     config = acting_config(manifest.config, where=f"the manifest of {reference}")
     try:
@@ -410,12 +416,12 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
     if isinstance(config, SkillDiscoveryConfig):
         return Trained(label, "skills", config, _skills(config, parameters), parameters, path=path)
     if isinstance(config, TaskConfig):
-        trained = None
+        acts_with = None
         if config.primitives_digest is not None:
-            trained = _find_frozen(label, config.primitives, config.primitives_digest, place)
-        policy = learned_policy(parameters, trained, config, config.hold_steps)
+            acts_with = _find_frozen(label, config.primitives, config.primitives_digest, place)
+        policy = learned_policy(parameters, acts_with, config, config.hold_steps)
         task = find_task(config.task, config.code, config.task_world)
-        about: dict[str, Any] = {"task": task, "method": config.method, "trained": trained}
+        about: dict[str, Any] = {"task": task, "method": config.method, "acts_with": acts_with}
         return Trained(label, "orchestrator", config, policy, parameters, path=path, **about)
     networks: dict[str, Parameters] = {"bob/policy": parameters}
     alice = None
@@ -430,9 +436,9 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
     )
 
 
-def learned_policy(parameters: Parameters, trained: Trained | None, config: Config, hold_steps: int) -> LearnedPolicy:
+def learned_policy(parameters: Parameters, acts_with: Trained | None, config: Config, hold_steps: int) -> LearnedPolicy:
     """A policy of a task, of its actor's parameters, and of what it acts with, learned in the world of ``config``."""
-    frozen = None if trained is None else trained.skills if trained.kind == "skills" else trained.primitives
+    frozen = None if acts_with is None else acts_with.skills if acts_with.kind == "skills" else acts_with.primitives
     return LearnedPolicy(parameters, frozen, layouts(config.world), hold_steps)
 
 

@@ -344,8 +344,10 @@ class Registry:
     def _describe_missing(self, name: str, target: int | str) -> str:
         versions = self.versions(name)
         if not versions:
-            known = ", ".join(self.names()) or "nothing yet"
-            return f"no {name!r} in the registry {self.root}; it holds: {known}; pick one of those or another registry"
+            known = ", ".join(self.names())
+            return f"no {name!r} in the registry {self.root}; " + (
+                f"it holds: {known}; name one of those, or another registry" if known else "nothing is published there"
+            )
         there = self.aliases(name)
         aliases = ", ".join(f"{alias} -> {number}" for alias, number in there.items()) or "none"
         kind = "version" if isinstance(target, int) else "alias"

@@ -52,9 +52,9 @@ def for_robot(trained: Trained) -> Trained:
         TandemError: skills, a policy that composes nothing, one of another robot, or one that observes obstacles.
     """
     trained.expect("primitives", "orchestrator", by="tandem robot")
-    if trained.kind == "orchestrator" and trained.trained is None:
+    if trained.kind == "orchestrator" and trained.acts_with is None:
         raise TandemError(f"{trained.label} acts without primitives; a bridge plays what composes them")
-    check_robot(trained.trained or trained)
+    check_robot(trained.acts_with or trained)
     found = trained.nominal
     if found.world.num_observed_obstacles:
         raise TandemError(f"{found.label} observes obstacles, and the bridge measures objects alone; train without")

@@ -313,8 +313,8 @@ def publish_learned(
     directory.claim(resume=True)
     with closing(directory):
         learned = load(str(path.absolute()), registry, primitives)
-        if learned.trained is not None:
-            changed["primitives"] = learned.trained.reference
+        if learned.acts_with is not None:
+            changed["primitives"] = learned.acts_with.reference
         config = config.model_copy(update=changed)
         check_publishable(config, registry)
         if metrics is None:

@@ -39,16 +39,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from pydantic import BaseModel, JsonValue, TypeAdapter
 
-from service.base.errors import CheckpointError, ConfigError, RunTakenError, StorageError, TandemError
+from service.base.errors import TRACEBACK_PREFIX, CheckpointError, ConfigError, RunTakenError, StorageError, TandemError
 from service.base.files import Appender, os_errors, remove_temporaries, write_atomic
 from service.base.jsonl import JsonlWriter
-from service.base.lock import DirectoryLock, claim_epoch, give_back_epoch, newest_epoch
+from service.base.lock import LOCK_FILE, DirectoryLock, claim_epoch, give_back_epoch, newest_epoch
 from service.base.parsing import parse_json
 from service.base.types import FloatArray, StateArray
 from service.base.version import LEARNING_VERSION, git_commit
 from service.config import Config, dump_config, load_config
 from service.store.checkpoints import CheckpointStore
-from service.store.models import CONFIG_FILE, GOALS_FILE, METRICS_FILE, STUDY_FILE
+from service.store.models import CONFIG_FILE, GOALS_FILE, METRICS_FILE, OUTPUT_FILE, STUDY_FILE
 from service.store.run_history import (
     BEFORE,
     Event,
@@ -67,6 +67,8 @@ MAX_DIVERGED_FILES = 100
 RECORDINGS = "recordings"
 RESULT_FILE = "result.json"
 """What was measured at the end of a run."""
+_BEFORE_A_RUN = (".", TRACEBACK_PREFIX, OUTPUT_FILE)
+"""How names of files begin that may be where a run begins."""
 MAX_RECORDINGS = 20
 
 
@@ -279,6 +281,11 @@ class RunDirectory:
             raise TandemError(f"{self.path} holds a run already; continue it with --resume, or name another --run-dir")
         if (self.path / STUDY_FILE).is_file():
             raise TandemError(f"{self.path} holds a study; name another --run-dir")
+        if self.path.exists() and not (self.path / LOCK_FILE).exists():  # with it, a run tried to begin here
+            with os_errors("read", self.path):
+                others = sorted(each.name for each in self.path.iterdir() if not each.name.startswith(_BEFORE_A_RUN))
+            if others:
+                raise TandemError(f"{self.path} holds no run, but {others[0]!r}; name another --run-dir")
 
     def record(self, metrics: dict[str, float]) -> None:
         """Append one iteration's metrics to metrics.jsonl and TensorBoard; where a disk is full they wait in memory."""

@@ -107,8 +107,8 @@ def test_files_and_modules_are_read(tmp_path, monkeypatch):
         ("gone.py", "no such file"),
         ("gone", "no module of that name"),
         ("sys", "no module of that name with Python code"),
-        ("bytes.py", "no text: "),
-        ("long.py", "longer than 40000 bytes; a run keeps its text"),
+        ("bytes.py", "no UTF-8 text (invalid"),
+        ("long.py", "longer than 40000 bytes; name a shorter file"),
     ):
         with pytest.raises(CodeError) as error:
             text_of(origin)

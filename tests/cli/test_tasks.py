@@ -168,7 +168,9 @@ def test_methods_and_tasks_are_listed():
     ("arguments", "words"),
     [
         (["lift"], "'lift': no recipe, task or file of that name"),
-        (["wall", "--method", "vic"], "method = 'vic': choose one of"),
+        (["metra"], "did you mean panda-cube-metra?"),
+        (["ours-her"], "ours-her is a method of tasks: tandem train push --method ours-her"),
+        (["wall", "--method", "vic"], "--method vic: of a task choose one of ours, ours-her, "),
         (["wall", "--method", "idle"], "idle learns nothing: measure it by tandem evaluate --task wall --method idle"),
         (["--method", "ours"], "--method ours is for a task"),
         (

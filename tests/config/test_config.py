@@ -141,7 +141,7 @@ def test_overrides_beat_the_file_and_the_last_one_wins(tmp_path):
         ("world.object={shape: capsule, size_m: [0.05, 0.04]}", ["length 0.04 must exceed its diameter"]),
         ("world.object={shape: sphere, size_m: [50]}", ["world.object.size_m.0", "less than or equal to 0.5"]),
         ("world.object={shape: sphere, size_m: [0.05], color: [1, 2, 0]}", ["color.1", "less than or equal to 1"]),
-        ("world.fixtures=[{shape: box, size_m: [0.05, 0.05, 0.05]}]", ["world.fixtures.0.position_m", "required"]),
+        ("world.fixtures=[{shape: box, size_m: [0.05, 0.05, 0.05]}]", ["world.fixtures.0.position_m", "is missing"]),
         ("game={num_worlds: 0, num_goals: 0}", ["game.num_worlds = 0", "(and 1 more)"]),
         ("world.fixtures={shape: box}", ["world.fixtures"]),
         (f"world.obstacles=[{', '.join(['{shape: sphere, size_m: [0.02]}'] * 9)}]", ["world.obstacles", "at most 8"]),

@@ -88,7 +88,7 @@ def test_rows_hold_a_view_but_for_goal_and_memory(worlds):
     np.testing.assert_allclose(after.goal[:, 0], GOAL[::-1], rtol=1e-6)
     uses = (lambda m: m[:, 0], lambda m: m + 1, lambda m: np.ones(2) < m, lambda m: m.any(), np.asarray, len, bool)
     for use in uses:
-        with pytest.raises(LookupError, match="memory is not known here"):
+        with pytest.raises(LookupError, match="memory is not known where a reward is computed again"):
             use(after.memory)
 
 

@@ -220,7 +220,7 @@ def test_what_does_not_compute_the_same_is_not_left_behind(registry, tmp_path):
     [
         (["--format", "onx"], ["unknown", "choose one of"]),
         (["--format", "numpy", "--part", "gate"], ["unknown", "choose one of"]),
-        (["--format", "numpy", "--primitives", "made"], ["made@1 acts with no others"]),
+        (["--format", "numpy", "--primitives", "made"], ["made@1 acts with nothing else"]),
         (["--format", "onnx"], ["onnx, which is not installed", "pip install 'tandem-skills[export]'"]),
     ],
 )

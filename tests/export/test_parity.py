@@ -26,7 +26,7 @@ def learned(bob, method):
     seen = layouts(bob.config.world)
     actor = actor_of(method, seen)
     policy = LearnedPolicy(actor, bob.primitives, seen)
-    return Trained("made", "orchestrator", bob.config, policy, actor, task="push", method=method, trained=bob)
+    return Trained("made", "orchestrator", bob.config, policy, actor, task="push", method=method, acts_with=bob)
 
 
 def networks():

@@ -245,7 +245,7 @@ def test_another_version_of_that_name_does_not_pass_for_its_primitives(home, cha
         own.publish(manifest.name, parameters, **fields)
     run = home / "runs" / "ours"
     found = service.load(str(run), own.root)
-    assert found.trained.label == f"{champion.manifest.reference} (bundled)"
+    assert found.acts_with.label == f"{champion.manifest.reference} (bundled)"
 
     reason = refused(run, own.root, primitives=f"{manifest.name}@{number}")
     assert f"acts with {champion.manifest.reference} of digest" in reason
@@ -284,7 +284,7 @@ def test_orchestrators_and_primitives_are_not_taken_for_each_other(home, champio
 
 def test_a_policy_from_nothing_needs_the_world_alone(home, champion, observation, tmp_path):
     found = service.load(str(home / "runs" / "scratch-monolithic"), tmp_path)
-    assert found.trained is None
+    assert found.acts_with is None
     assert acted(found, observation).shape == (2, 3, 4)
     for wrong, said in (
         (observation[:1], r"1 rows, and 3 in the step before: call begin\(\)"),
@@ -294,7 +294,7 @@ def test_a_policy_from_nothing_needs_the_world_alone(home, champion, observation
             found.act_deterministic(wrong)
     found.begin()
     assert found.act_deterministic(observation[:1]).shape == (1, 4)
-    assert "acts with no others" in refused(
+    assert "acts with nothing else" in refused(
         home / "runs" / "scratch-monolithic", tmp_path, primitives="panda-cube@champion"
     )
 

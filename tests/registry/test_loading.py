@@ -166,8 +166,8 @@ def test_every_kind_from_a_service_as_from_its_registry(tmp_path, monkeypatch):
     assert_one_line(error.value, server.url, "no 'nobody'")
     assert np.array_equal(fetched.act_deterministic(rows), bob.act_deterministic(rows))
     assert (fetched.kind, skills.kind, training.kind) == ("primitives", "skills", "orchestrator")
-    assert (training.trained.label, training.task.name, training.world.fixture) == ("made@1", "wall", "wall")
-    assert training.primitives is training.trained.policy
+    assert (training.acts_with.label, training.task.name, training.world.fixture) == ("made@1", "wall", "wall")
+    assert training.primitives is training.acts_with.policy
     local = load(str(tmp_path / "training"), registry.root)
     assert np.array_equal(training.player().act_deterministic(rows), local.player().act_deterministic(rows))
 
@@ -201,7 +201,7 @@ def test_what_each_kind_has(kinds):
     assert (bob.goal_kind, bob.num_steps, bob.success_distance_m) == ("mixed", 4, bob.config.game.success_distance_m)
     assert (task.goal_kind, task.num_steps, task.success_distance_m) == ("table", 50, 0.05)
     assert task.world.gripper == "blocked"
-    assert alone.trained is None
+    assert alone.acts_with is None
     assert alone.config.world == bob.config.world
     assert (bob.on("wall").title, bob.on("wall").world.fixture) == ("made@1 on Wall", "wall")
     with pytest.raises(TandemError, match="unknown task 'lift'"):
@@ -302,7 +302,7 @@ def test_a_directory_without_a_run(tmp_path):
     assert_one_line(error.value, "elsewhere is a folder of tandem export", "name what it was made of")
     with pytest.raises(TandemError) as error:
         load("panda-cube@champion", primitives="panda-cube@1")
-    assert_one_line(error.value, "acts with no others: leave out primitives panda-cube@1")
+    assert_one_line(error.value, "acts with nothing else: leave out primitives 'panda-cube@1'")
 
 
 def test_a_run_without_a_checkpoint(tmp_path):

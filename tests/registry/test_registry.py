@@ -73,7 +73,7 @@ def test_a_parent_is_named_with_its_version(registry: Registry, publish: Publish
 
 
 def test_unknown_references_list_what_exists(registry: Registry, publish: Publish) -> None:
-    with pytest.raises(UnknownVersionError, match="it holds: nothing yet"):
+    with pytest.raises(UnknownVersionError, match="nothing is published there"):
         registry.resolve("panda-cube")
     publish()
     publish()

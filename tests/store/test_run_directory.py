@@ -56,6 +56,21 @@ def test_a_second_run_is_refused(directory):
     assert_one_line(error.value, directory.path, "--resume", "--run-dir")
 
 
+def test_a_directory_of_something_else_is_refused(tmp_path):
+    for name in (".git", "tandem-error-1.txt", "log.txt"):
+        (tmp_path / name).touch()
+    directory = RunDirectory(tmp_path)
+    directory.claim(resume=False)
+    directory.close()
+    (tmp_path / "notes.md").touch()
+    with pytest.raises(TandemError) as error:
+        directory.claim(resume=False)
+    assert_one_line(error.value, tmp_path, "holds no run, but 'notes.md'", "another --run-dir")
+    (tmp_path / ".lock").touch()  # of a run that was killed while it began
+    directory.claim(resume=False)
+    directory.close()
+
+
 def test_nothing_is_left_of_a_run_that_did_not_begin(tmp_path):
     directory = RunDirectory(tmp_path / "run")
     directory.claim(resume=False)

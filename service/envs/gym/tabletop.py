@@ -78,7 +78,7 @@ class GoalWorlds:
         self._random = [seeding.np_random()[0] for _ in range(num_worlds)]
 
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
-        """Reward of (..., 3 K) achieved for (..., 3 K) desired goals, metres: (...) float64, 1 where reached, else 0.
+        """Compute (...) float64 rewards of (..., 3 K) achieved for (..., 3 K) desired goals, metres, as the task pays.
 
         ``info`` is there for the convention of goal environments and is not read.
 
@@ -90,11 +90,11 @@ class GoalWorlds:
         return self.rules.reward(view_of_places(*flat)).reshape(achieved.shape[:-1])
 
     def rewards_of(self, rows: FloatArray, goal: FloatArray) -> NDArray[np.float64]:
-        """(B,) rewards for steps that led to (B, V) ``View.rows``, had the goals (B, 3 K) been others, metres."""
+        """Compute again the (B,) rewards of steps to (B, V) ``View.rows``, for other goals, (B, 3 K) metres."""
         return self.rules.reward(View.of_rows(rows, each_object(goal)))
 
     def state(self) -> EnvState:
-        """Copy everything that :meth:`restore` needs."""
+        """Copy everything that ``restore`` needs."""
         random = tuple(deepcopy(dict(each.bit_generator.state)) for each in self._random)
         kept = self._goal.copy(), self.rules.elapsed.copy(), self.rules.memory.copy()
         return EnvState(self._worlds.states.copy(), *kept, random)
@@ -196,7 +196,7 @@ def action_space() -> gymnasium.Space[FloatArray]:
 
 
 class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
-    """A robot at a table, K rigid objects, one in most worlds, and a goal for each object's centre.
+    """A Gymnasium environment: bring each of K objects to its goal, a place for its centre.
 
     - observation: ``observation`` (P,) positions as Bob's primitives see them (``service.envs.observations``), 11 or as
       many as ``config`` says, ``achieved_goal`` (3 K,) and ``desired_goal`` (3 K,) objects and goals in the world
@@ -205,8 +205,8 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
       arm covers about 3 cm in a step), change of the finger width (1 is 10 cm).
     - reward: 1 at every step each object is within ``success_distance_m`` of its goal, else 0 (paper, downstream
       tasks); or what the task says.
-    - never terminates; truncated where the physics diverged, or the steps of the task are over. For others than
-      these: ``task=replace(find_task("push"), episode_steps=100)``.
+    - never terminates; truncated where the physics diverged, or the steps of the task are over. Another
+      length: ``task=replace(find_task("push"), episode_steps=100)``.
 
     ``info`` holds ``is_success`` (bool) and, after a step, ``diverged`` (bool).
 
@@ -248,7 +248,7 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Arm at home, object at a random place on the table, a new random goal, a box elsewhere.
+        """Start an episode: the arm at home, objects, goal and fixtures at random places.
 
         Args:
             seed: restarts the environment's random numbers; the same seed gives the same episodes, bit for bit.
@@ -266,12 +266,19 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
         return _first(observation), {"is_success": bool(self.rules.success(view)[0])}
 
     def step(self, action: FloatArray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Act for one control step.
+        """Act for one control step of 40 ms.
+
+        Args:
+            action: (4,) in [-1, 1]; see the class.
 
         Raises:
-            ValueError: action of the wrong shape or not finite.
+            ValueError: action of the wrong shape.
+            DivergedError: an action that is not finite.
         """
-        diverged = bool(self._advance(np.asarray(action, dtype=np.float32)[None])[0])
+        command = np.asarray(action, dtype=np.float32)
+        if command.shape != (ACTION.size,):
+            raise ValueError(f"action: expected shape {(ACTION.size,)}, x, y, z and finger width, got {command.shape}")
+        diverged = bool(self._advance(command[None])[0])
         observation, view = self._observe()
         truncated = diverged or bool(self.rules.elapsed[0] >= self.rules.task.episode_steps)
         info = {"is_success": bool(self.rules.success(view)[0]), "diverged": diverged}

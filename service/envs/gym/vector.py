@@ -40,6 +40,7 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
 
     Raises:
         TandemError: unknown ``task``, goals that the world cannot have, or a distance that is not positive.
+        ValueError: ``num_envs`` below 1.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - as the base class has it
@@ -54,6 +55,8 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         max_episode_steps: int | None = None,
         num_threads: int = 0,
     ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs = {num_envs}; give at least 1")
         super().__init__(num_envs, num_threads, config, task, success_distance_m)
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps or self.rules.task.episode_steps
@@ -88,10 +91,14 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         return observation, _with_masks({"is_success": self.rules.success(view)})
 
     def step(self, actions: FloatArray) -> tuple[Observation, NDArray[Any], BoolArray, BoolArray, Info]:
-        """Act for one control step in every world; see the class for what happens where an episode ends.
+        """Act for one control step of 40 ms in every world; see the class for what happens where an episode ends.
+
+        Args:
+            actions: (N, 4) in [-1, 1], as of ``TabletopEnv``.
 
         Raises:
-            ValueError: actions of the wrong shape or not finite.
+            ValueError: actions of the wrong shape.
+            DivergedError: actions that are not finite.
         """
         diverged = self._advance(actions)
         observation, view = self._observe()

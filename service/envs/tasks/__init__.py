@@ -31,8 +31,8 @@ def find_task(name: str, code: Mapping[str, str] | None = None, world: Mapping[s
 
     Args:
         name: one of ``TASKS``; or ``FILE.py``, ``FILE.py:NAME`` or ``MODULE:NAME``.
-        code: texts that a run has recorded, by origins; a file that is not among them is read.
-        world: the settings of its world that a run has recorded, of a user's.
+        code: texts that a run has recorded, by the names of their files; other files are read.
+        world: settings of the world of a user's task, as a run has recorded them; None: those in the file.
 
     Raises:
         TandemError: no such task, or a file that has none.

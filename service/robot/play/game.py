@@ -67,7 +67,7 @@ class Game:
 
     def take(self, players: Trained) -> None:
         """Let these play from now on; of the same run, later ones."""
-        config, acting = players.config, players.trained or players
+        config, acting = players.config, players.acts_with or players
         plays = not isinstance(config, SelfPlayConfig) or config.game.alice_plays
         self.players, self.title = players, players.title
         self.primitives = acting.policy if isinstance(acting.policy, NumpyMCPPolicy) else None

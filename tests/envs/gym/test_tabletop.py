@@ -11,6 +11,7 @@ from service.base.errors import TandemError
 from service.config import WorldConfig
 from service.envs.gym.registration import TABLETOP_ID
 from service.envs.gym.tabletop import TabletopEnv
+from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.task import EPISODE_STEPS, Task
 
 CONFIG = WorldConfig(physics_step_s=0.004, num_substeps=10)
@@ -171,8 +172,13 @@ def test_a_diverged_world_ends_the_episode(env):
 @pytest.mark.parametrize("action", [np.zeros(3), np.zeros((1, 4)), np.array([0.0, np.nan, 0.0, 0.0])])
 def test_bad_actions_are_refused(env, action):
     env.reset(seed=0)
-    with pytest.raises(ValueError, match="actions"):
+    with pytest.raises(ValueError, match="action"):
         env.step(action.astype(np.float32))
+
+
+def test_no_worlds_are_refused():
+    with pytest.raises(ValueError, match="num_envs = 0; give at least 1"):
+        TabletopVectorEnv(0, CONFIG)
 
 
 @pytest.mark.parametrize(("option", "value"), [("render_mode", "human"), ("success_distance_m", 0.0)])

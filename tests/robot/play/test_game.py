@@ -150,7 +150,7 @@ def test_a_task_and_its_orchestrator(champion):
         torch.manual_seed(4)
         actor = export_parameters(GaussianActor(num_inputs(seen)[1], num, (8,)))
     policy = Counting(actor, champion.primitives, seen)
-    common = {"task": find_task("wall"), "method": "ours", "trained": champion}
+    common = {"task": find_task("wall"), "method": "ours", "acts_with": champion}
     game = Game(Trained("mine@1", "orchestrator", champion.config, policy, actor, **common), seed=0)
     begun.clear()
     game.reset()
