@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.actors.self_play import SelfPlay
+from service.actors.self_play import SelfPlay, _contact_metrics
 from service.base.liveness import work_done
 from service.envs.batch import WorldBatch
 from service.generator.opponents import RoundPlan
@@ -490,7 +490,19 @@ def test_every_step_of_both_turns_counts_as_work():
 def test_contact_fractions():
     metrics = play(make_game(make_config(4), [IN_FRONT, AT_REST, SLIDES, AT_REST]), Pusher()).metrics
     assert metrics["alice/contact_fraction"] == 0.25
-    assert metrics["alice/both_contact_fraction"] <= 0.25
+
+
+@pytest.mark.parametrize(
+    ("touched", "contact", "both"),
+    [
+        ([[1, 0], [1, 1], [0, 0], [0, 1]], 0.75, 0.25),
+        ([[1, 0, 0, 1], [0, 0, 1, 1]], 1.0, 0.5),  # two objects: no one object by both fingers in the first
+    ],
+)
+def test_contact_fractions_by_hand(touched, contact, both):
+    """Of (N, 2 K) left and right fingers on each object."""
+    found = _contact_metrics(np.array(touched, dtype=bool))
+    assert found == {"alice/contact_fraction": contact, "alice/both_contact_fraction": both}
 
 
 # --- without Alice ---------------------------------------------------------------------------------------------------
@@ -623,6 +635,16 @@ def test_a_world_that_breaks_in_bobs_turn_says_nothing_about_either_player():
     assert not rollout.records.played[1]  # or the difficulty statistics would count a failure
     assert len(rollout.demonstrations.action) == 9  # of world 0 alone
     assert rollout.alice.learn.tolist() == [True, False, True]
+
+
+def test_without_alice_a_world_that_breaks_begins_anew(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    game = make_game(without_alice(2, num_goals=3), [IN_FRONT] * 2)
+    game.worlds._pool = Diverging(game.worlds._pool, call=1, row=1)
+    rollout = play(game, choose_goals=given((-0.1, -0.1, 0.025)))
+    assert not rollout.bob.learn[1]
+    assert game._round_index.tolist() == [1, 0]
+    assert_fresh(game, [1])
 
 
 def test_a_broken_world_is_reported_with_state_and_action_once():

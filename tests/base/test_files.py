@@ -6,7 +6,7 @@ import pytest
 
 from service.base import files
 from service.base.errors import StorageError
-from service.base.files import Appender, open_regular, open_to_append, read_regular
+from service.base.files import Appender, open_regular, open_to_append, read_regular, write_atomic
 from tests.runs.runs import assert_one_line, no_room_above
 
 
@@ -158,3 +158,14 @@ def test_what_a_link_leads_to_is_not_changed(tmp_path):
         Appender(tmp_path / "link").append_bytes(b"a")
     assert_one_line(error.value, "cannot write", tmp_path / "link", "a symbolic link")
     assert (tmp_path / "precious").read_text() == "precious"
+
+
+def test_a_file_and_then_its_directory_are_flushed_or_nothing(tmp_path, monkeypatch):
+    flushed = []
+    monkeypatch.setattr(os, "fsync", lambda descriptor: flushed.append(os.readlink(f"/proc/self/fd/{descriptor}")))
+    write_atomic(tmp_path / "a", b"x")
+    assert len(flushed) == 2
+    assert flushed[0] != flushed[1] == str(tmp_path)
+    flushed.clear()
+    write_atomic(tmp_path / "a", b"x", flush=False)
+    assert flushed == []

@@ -295,6 +295,42 @@ def test_an_update_that_was_stopped_early_lowers_the_learning_rate():
     assert player.optimizer.learning_rate == pytest.approx(CONFIG.learning_rate / 1.5)
 
 
+@pytest.mark.parametrize(("decoupled", "loss", "clipped"), [(True, -1.5, 0.0), (False, -1.2, 1.0)])
+def test_the_ratio_is_clipped_around_the_start_of_the_update_or_the_policy_that_acted(decoupled, loss, clipped):
+    """The policy that acted gave these actions 1 / 1.5 of the density that the newest gives them."""
+    player = make_player(num_epochs=1, learning_rate=1e-9, decoupled=decoupled)
+    samples = play(player, np.random.default_rng(0), num=32)
+    older = samples.behaviour_log_prob - math.log(1.5)
+    steps = train(
+        player,
+        replace(samples, advantage=torch.ones(32), behaviour_log_prob=older),
+        None,
+        ABC,
+        np.random.default_rng(0),
+    )
+    assert steps.scalars["policy_loss"][0].item() == pytest.approx(loss, rel=1e-5)
+    assert steps.scalars["clip_fraction"][0].item() == clipped
+
+
+def test_an_update_whose_kl_is_no_number_is_undone():
+    """At this learning rate one step takes the std below what a float holds."""
+    player = make_player(num_epochs=1, learning_rate=1e4)
+    samples = play(player, np.random.default_rng(0), num=32)
+    before = player.state()
+    metrics = update(player, replace(samples, advantage=1.0 - (samples.action[:, 0] / 0.6065).square()))
+    assert_undone(metrics, player, before)
+
+
+def test_the_kl_is_from_the_policy_before_to_the_one_after():
+    """By hand, of Gaussians: (0, e^-0.5) before, one step later (m, e^(l - 0.5))."""
+    once, twice = (make_player(num_epochs=num, learning_rate=0.05) for num in (1, 2))
+    samples = play(once, np.random.default_rng(0), num=32)
+    train(once, samples, None, ABC, np.random.default_rng(0))
+    mean, log_ratio = once.policy.mean.item(), once.policy.log_std.item() + 0.5
+    expected = log_ratio + (1 + mean * mean * math.e) / (2 * math.exp(2 * log_ratio)) - 0.5
+    assert train(twice, samples, None, ABC, np.random.default_rng(0)).kls == [pytest.approx(expected, rel=1e-3)]
+
+
 def test_reported_kl_is_that_of_the_whole_update():
     player = make_player()
     samples = play(player, np.random.default_rng(0))

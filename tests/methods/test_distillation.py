@@ -4,15 +4,16 @@ import numpy as np
 import pytest
 import torch
 
-from service.actors.distillation import _LEAST_LOG_WEIGHT, _NOISY_SHARE, DistillationWorlds
+from service.actors.distillation import _LEAST_LOG_WEIGHT, _NOISY_SHARE, DistillationWorlds, Lesson
 from service.base.errors import ConfigError, TandemError
 from service.config import parse_config
 from service.config.distillation import DistillationConfig
 from service.envs.batch import WorldBatch
-from service.envs.observations import PAPER, POSITIONS, layouts
+from service.envs.observations import BOB, PAPER, POSITIONS, layouts
 from service.envs.sampling import inside_obstacles
 from service.learner.distillation import Distiller
 from service.learner.transfer import BOB_INPUTS, take_over
+from service.methods.distillation import Distillation
 from service.policies import networks
 from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
 from service.registry.loading import Trained, load
@@ -226,6 +227,53 @@ def test_a_run_of_distillation_can_be_begun_from_as_well(taught, tmp_path):
     world = config.world.model_dump(mode="json") | {"obstacles": [{"shape": "box", "size_m": [0.06, 0.06, 0.1]}]}
     config = parse_config(config.model_dump(mode="json") | {"world": world}, where="a test")
     run_to_end(tmp_path / "again", config, start)  # among obstacles, which this teacher does not see
+
+
+def a_lesson(student, gate_weight, num=8):
+    """Where the student's primitives are right already, and his gate is asked for one weight."""
+    observation = torch.randn(num, BOB.size)
+    means, variances = (each.detach().numpy() for each in student.primitives(observation[:, : POSITIONS.size]))
+    weights = np.full((num, means.shape[1]), gate_weight, np.float32)
+    return Lesson(observation.numpy(), means, variances, weights)
+
+
+def test_the_average_follows_and_the_learning_rate_falls_to_a_fiftieth():
+    student, how = make_teacher(config_of({})), DistillationConfig(gradient_steps=1, batch_size=4)
+    distiller, lesson, rng = Distiller(student, how), a_lesson(student, 0.5), np.random.default_rng(0)
+    before = {name: parameter.detach().clone() for name, parameter in student.named_parameters()}
+    distiller.learn(lesson, 0.0, rng)
+    average = distiller.averaged_parameters()
+    assert any((before[name] != parameter).any() for name, parameter in student.named_parameters())
+    for name, parameter in student.named_parameters():
+        expected = 0.9 * before[name] + 0.1 * parameter.detach()
+        np.testing.assert_allclose(average[name], expected, atol=1e-6)
+    rates = [distiller.learn(lesson, progress, rng)["learning_rate"] for progress in (0.5, 1.0, 3.0)]
+    assert rates == pytest.approx([0.51e-3, 0.02e-3, 0.02e-3])
+
+
+def test_the_gate_is_taught_where_the_action_says_nothing_of_it():
+    """Of one primitive the composition has the same mean at any weight."""
+    policy = config_of({}).policy
+    policy = policy.model_copy(update={"bob": policy.bob.model_copy(update={"num_primitives": 1})})
+    torch.manual_seed(0)
+    student = networks.make_bob(policy)
+    distiller = Distiller(student, DistillationConfig(gradient_steps=50, batch_size=8, learning_rate=1e-2))
+    lesson, rng = a_lesson(student, 0.9), np.random.default_rng(0)
+    first, last = (distiller.learn(lesson, 0.0, rng)["gate_error"] for _ in range(2))
+    assert last < 0.2 * first
+
+
+def test_what_is_published_before_anything_is_learned_is_the_teacher():
+    teacher = config_of({})
+    parameters = networks.export_parameters(networks.make_bob(teacher.policy, layouts(teacher.world)))
+    learned = {"bob/policy": parameters}
+    start = Trained("a test", "primitives", teacher, numpy_bob(parameters), parameters, networks=learned)
+    method = Distillation(teacher.model_copy(update={"seed": 5}), start)
+    method.start()
+    found = method.parameters()
+    method.close()
+    for name, array in parameters.items():
+        np.testing.assert_array_equal(found[name], array)
 
 
 @pytest.mark.parametrize(

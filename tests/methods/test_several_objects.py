@@ -1,6 +1,7 @@
 """What is trained with two cubes: samples, hindsight, the live world, what it is asked for, and what refuses it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ from service.base.errors import TandemError
 from service.cli.evaluate import parse_goals
 from service.config import load_config, parse_config
 from service.config.recipes import recipes
-from service.envs.observations import distances, each_object
+from service.envs.observations import Layouts, distances, each_object
 from service.envs.tasks import find_task
-from service.methods.task import _mixed
+from service.learner.replay import ReplayBuffer
+from service.methods.task import Hindsight, _mixed
+from service.methods.task_worlds import columns
 from service.robot.play.game import Game
 from service.robot.pybullet_robot import PyBulletParameters, world_of
 from service.runs.train import open_run
@@ -123,3 +126,19 @@ def test_who_knows_one_object_says_so(two):
         service.load().playing(more)
     with pytest.raises(TandemError, match="skill discovery moves one object"):
         load_config(recipes()["panda-cube-lsd"], ["world.objects=[cube,cube]"])
+
+
+def test_a_relabelled_goal_has_the_place_that_at_least_one_object_came_to():
+    """Everything that was achieved is at 0, everything that was asked at 1."""
+    seen, num = Layouts(num_objects=2), 200
+    sizes = {**columns(seen), "action": 4}
+    replay = ReplayBuffer(5, num, sizes)
+    rows = {name: np.zeros((num, size), np.float32) for name, size in sizes.items()}
+    rows["goal"] += 1.0
+    for step in range(5):
+        replay.add(rows, np.full(num, step == 4))
+    relabelled = []
+    worlds = SimpleNamespace(seen=seen, rewards=lambda rows, goal: relabelled.append(goal) or np.zeros(len(goal)))
+    Hindsight(worlds, (1.0, 1.0))(replay, 400, np.random.default_rng(0))
+    achieved = relabelled[0].reshape(-1, 2, 3)[:, :, 0] == 0.0
+    assert set(achieved.sum(axis=1).tolist()) == {1, 2}

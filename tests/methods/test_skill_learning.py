@@ -1,5 +1,7 @@
 """Skill discovery as a whole: on a point mass, where it has to find skills that differ, and in worlds."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -123,7 +125,7 @@ def test_losing_the_object_gives_back_what_moving_it_has_earned(method):
         assert earned != 0.0
 
 
-def test_the_network_may_learn_from_the_newest_steps_alone():
+def test_the_newest_steps_of_a_buffer_are_drawn_alone():
     replay = ReplayBuffer(10, 2, {"number": 1})
     for number in range(25):
         replay.add({"number": np.full((2, 1), number, np.float32)}, np.zeros(2, bool))
@@ -139,6 +141,23 @@ def small_config(**skills):
     world = {"physics_step_s": 0.005, "num_substeps": 8}
     run = {"total_env_steps": 400}
     return parse_config({"method": "skills", "skills": tree, "world": world, "run": run}, where="a test")
+
+
+def test_the_network_may_learn_from_the_newest_steps_alone_and_the_policy_from_all():
+    config = small_config(newest_steps=12, gradient_steps=2).skills
+    asked, one = [], np.zeros((1, 4), np.float32)
+    replay = SimpleNamespace(
+        num_worlds=3,
+        draw=lambda size, rng, newest=None: asked.append((size, newest)),
+        read=lambda drawn: {"skill": one, "action": one},
+    )
+    place = np.zeros((1, 3), np.float32)
+    seen = SimpleNamespace(before=place, after=place, stepped=np.ones(1, bool), inputs=None, next_inputs=None)
+    reward = SimpleNamespace(
+        learn=lambda *given: 0.0, rewards=lambda *given: torch.zeros(1), pays_jumps=True, pays_features=False
+    )
+    IntrinsicBatches(reward, config, lambda rows: seen)(replay, 64, np.random.default_rng(0))
+    assert asked == [(8, 4), (8, 4), (64, None)]  # 12 steps of 3 worlds are 4 of each
 
 
 @pytest.mark.parametrize("method", SKILLS_OF)

@@ -104,6 +104,21 @@ def test_skills_of_actions_by_hand():
         np.testing.assert_allclose(made(method).skills.from_action(action), skill, rtol=1e-6)
 
 
+def test_the_skill_towards_a_goal_is_the_direction_of_its_way_in_phi():
+    """METRA's phi by hand: one hidden layer of ReLU on the place, centred and scaled."""
+    skills, rng = made("metra").skills, np.random.default_rng(0)
+    positions = rng.uniform(-0.1, 0.1, (5, POSITIONS.size)).astype(np.float32)
+    goal = rng.uniform(-0.1, 0.3, (5, 3)).astype(np.float32)
+    (first, first_bias), (second, second_bias) = skills.network
+
+    def phi(place):
+        return np.maximum((place - [0.0, 0.0, 0.15]) / 0.12 @ first + first_bias, 0.0) @ second + second_bias
+
+    way = phi(goal) - phi(positions[:, POSITIONS["object"]])
+    expected = way / np.linalg.norm(way, axis=1, keepdims=True)
+    np.testing.assert_allclose(skills.towards(positions, goal), expected, atol=1e-4)
+
+
 def test_zero_shot_acts_by_the_skill_towards_the_goal(skills):
     player, rng = ZeroShotPolicy(skills.skills), np.random.default_rng(0)
     rows = rng.uniform(-0.1, 0.1, (2, NUM, 14)).astype(np.float32)

@@ -306,6 +306,27 @@ def test_a_manifest_that_lacks_what_an_orchestrator_needs(tmp_path):
     assert refused("old@latest", tmp_path) == "old@1: its manifest lacks 'primitives_digest'; publish it again"
 
 
+@pytest.mark.parametrize("name", ["/tmp/their/run", "their/run", "panda-cube@champion", "panda-cube"])
+def test_what_a_published_policy_acts_with_is_a_version_and_no_path(tmp_path, name):
+    """A directory could bring code, and an alias may be moved."""
+    spaces = {"kind": "orchestrator", "method": "ours", "task": "push", "primitives": name}
+    spaces |= {"primitives_digest": "0" * 64, "hold_steps": 1}
+    nothing = {"normalisation": {}, "config": {}, "metrics": {}}
+    Registry(tmp_path).publish("bad", {"weight": np.zeros(1, dtype=np.float32)}, spaces=spaces, **nothing)
+    assert "which is no NAME@VERSION; publish it again" in refused("bad@latest", tmp_path)
+
+
+def test_hindsight_fades_out_with_the_run(champion):
+    """Of ours-her: 0.8 of the samples at first, none from half of the env steps on; here there are three iterations."""
+    method = TaskLearning(small_trial("ours-her").begin("no registry here", None), champion)
+    shares = []
+    for _ in range(3):
+        method.step()
+        shares.append(method.loop.make_batch.share)
+    method.close()
+    assert shares == pytest.approx([0.8, 0.8 / 3, 0.0])
+
+
 # --- bad input -------------------------------------------------------------------------------------------------------
 
 

@@ -1,15 +1,18 @@
 """The workers of both runners: a round needs nothing but what it is given at its start."""
 
 import pickle
+from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
 
+from service.config import parse_config
 from service.generator.ring import join_rows
 from service.learner.learner import Learner
 from service.methods.workers import GeneratorWorker, RolloutWorker
 from tests.actors.players import assert_same_rollout
-from tests.runs.runs import tiny_config
+from tests.runs.runs import TREE, tiny_config
 
 
 @pytest.fixture
@@ -21,8 +24,8 @@ def config():
 def make_actor(config):
     workers = []
 
-    def make(actor=0):
-        workers.append(RolloutWorker(config, actor, num_threads=1))
+    def make(actor=0, incarnation=0, config=config):
+        workers.append(RolloutWorker(config, actor, incarnation, num_threads=1))
         return workers[-1]
 
     yield make
@@ -45,6 +48,22 @@ def as_sent(value):
     buffers = []
     text = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
     return pickle.loads(text, buffers=[bytes(buffer.raw()) for buffer in buffers])
+
+
+def test_each_actor_and_each_that_replaces_one_plays_other_games(make_actor):
+    games = [make_actor(*which).game.worlds.object_position for which in ((0, 0), (1, 0), (0, 1))]
+    assert all((one != other).any() for one, other in combinations(games, 2))
+
+
+def test_grippers_are_blocked_by_the_success_that_the_generator_tells(make_actor):
+    game = TREE["game"] | {"blocked_gripper_fraction": 0.5, "blocked_gripper_min_success": 0.6}
+    config = parse_config(TREE | {"game": game}, where="a test")
+    generator, weights, actor = GeneratorWorker(config).generator, Learner(config).weights(), make_actor(config=config)
+    fractions = []
+    for rate in (0.59, 0.6):
+        actor.play(weights, replace(generator.snapshot(), success_rate=np.array(rate)), generator.opponents)
+        fractions.append(actor.game.worlds.blocked_fraction)
+    assert fractions == [0.0, 0.5]
 
 
 def test_a_round_is_a_function_of_what_it_is_given(learned, make_actor):

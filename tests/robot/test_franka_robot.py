@@ -105,7 +105,7 @@ def robot(franky):
 
 
 def until(condition):
-    end_s = time.monotonic() + 5.0
+    end_s = time.monotonic() + 60.0
     while not condition():
         assert time.monotonic() < end_s
         time.sleep(0.005)
@@ -245,6 +245,40 @@ def test_a_hand_that_is_silent_for_longer_than_a_motion_takes_stops_the_robot(ro
     monkeypatch.setattr(robot, "now_s", lambda: measured_s + 1.1)
     with pytest.raises(RobotError, match=r"franka at robot\.local: hand: no answer for 1\.1 s"):
         robot.read()
+
+
+def test_the_arm_is_told_its_greatest_contact_forces_and_stiffness(franky):
+    told = []
+    franky.robot.set_collision_behavior = lambda torque, force: told.append((torque, force))
+    robot = FrankaRobot(
+        franky,
+        FrankaParameters(
+            host="h", max_contact_force_n=20.0, max_contact_torque_nm=10.0, rotational_stiffness_nm_rad=50.0
+        ),
+    )
+    assert told == [(10.0, 20.0)]
+    robot.command(Command(np.zeros(3), 0.08))
+    robot.close()
+    assert franky.given == {"translational_stiffness": 1500.0, "rotational_stiffness": 50.0}
+
+
+def test_a_robot_that_was_stopped_before_its_first_command_takes_none(robot):
+    robot.stop()
+    with pytest.raises(RobotError, match="it was stopped"):
+        robot.command(Command(np.zeros(3), 0.08))
+
+
+def test_the_hand_has_its_speed_and_force_and_takes_an_object_of_any_width(gripper):
+    told = []
+    gripper.grasp_async = gripper.move_async = lambda *given: told.append(given)
+    hand = Hand(gripper, FrankaParameters(host="h", hand_speed_m_s=0.05))
+    hand.close()  # its thread; what it does is done here, one by one
+    for width_m in (0.02, 0.07):
+        hand.go_to(width_m, 20.0)
+        hand._running = None
+        hand.advance()
+        hand._running = None
+    assert told == [(0.02, 0.05, 20.0, 0.08, 0.08), (0.07, 0.05)]
 
 
 class Camera:

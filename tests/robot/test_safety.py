@@ -1,11 +1,14 @@
 """Whatever policy, robot and tracker do: set-points stay within their bounds, and every fault ends in a stop."""
 
+import threading
+
 import numpy as np
 import pytest
 
 from service.base.errors import ConfigError, RobotError
 from service.config import WorldConfig
 from service.envs.panda import PANDA
+from service.robot.calibrate import calibrate
 from service.robot.disturbed import DisturbanceConfig, DisturbedPoses, DisturbedRobot
 from service.robot.loop import Bridge, BridgeConfig
 from service.robot.safety import SafeRobot, SafetyConfig
@@ -236,3 +239,56 @@ def test_least_height_and_opening_are_those_of_the_policys_robot():
 def test_a_box_with_nothing_in_it(wrong):
     with pytest.raises(ConfigError, match=r"the box x .* is empty"):
         SafetyConfig(**wrong).box(WORLD)
+
+
+def test_a_command_has_its_greatest_force_and_least_opening():
+    robot = FakeRobot()
+    config = BridgeConfig(safety={"max_grip_force_n": 12.0, "min_width_m": 0.03})
+    Bridge(Steady([0.0, 0.0, 0.0, -1.0]), robot, robot.poses, WORLD, config).run(OBJECT_M, 2)
+    assert {command.grip_force_n for _, command in robot.commands} == {12.0}
+    assert {command.width_m for _, command in robot.commands} == {0.03}
+
+
+def test_a_command_that_overtakes_a_stop_is_followed_by_another_stop():
+    robot = FakeRobot()
+    safe = SafeRobot(robot, robot.poses, SafetyConfig(), WORLD)
+    safe.start(0.004)
+    command = robot.command
+
+    def late(sent):
+        safe.stop("by the other thread")
+        command(sent)
+
+    robot.command = late
+    robot.advance(0.004)
+    with pytest.raises(RobotError, match="stopped: by the other thread"):
+        safe.move(HOME_M, 0.08, 0.04)
+    assert len(robot.stops) == 2
+
+
+def test_a_clock_that_cannot_be_read_by_the_watch_is_a_fault():
+    robot = FakeRobot()
+    safe = SafeRobot(robot, robot.poses, SafetyConfig(), WORLD)
+
+    def now_s():
+        if threading.current_thread().name == "robot-watch":
+            raise OSError("gone")
+        return robot.time_s
+
+    robot.now_s = now_s
+    with safe.guarded():
+        assert robot.stopped.wait(60.0)
+    assert safe.stopped == "the robot's clock cannot be read: gone"
+
+
+def test_a_late_state_stops_the_robot():
+    robot = FakeRobot()
+    late = DisturbedRobot(robot, DisturbanceConfig(state_delay_s=0.12))
+    with pytest.raises(RobotError, match="state is 120 ms old"):
+        Bridge(Steady([0.1, 0.0, 0.0, 0.0]), late, robot.poses, WORLD, BridgeConfig()).run(OBJECT_M, 4)
+
+
+def test_an_arm_that_is_too_slow_is_not_calibrated():
+    config = BridgeConfig(safety={"max_tracking_error_m": 1.0})
+    with pytest.raises(RobotError, match=r"it covers 7%, 7%, 7% .*can be matched"):
+        calibrate("slow", FakeRobot(lag_s=0.5), WORLD, config)

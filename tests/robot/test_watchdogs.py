@@ -5,7 +5,7 @@ import pytest
 
 from service.base.errors import TandemError
 from service.robot import watchdogs
-from service.robot.interface import ObjectPose
+from service.robot.interface import ObjectPose, RobotState
 
 
 def test_a_key_counts_while_it_repeats(monkeypatch):
@@ -64,3 +64,22 @@ def test_each_of_two_objects_is_watched():
     assert watch.check(ObjectPose(0.0, [*first, None, None, None]), 0.0) == "object 2 is not seen"
     fault = watchdogs.PoseWatch(watchdogs.WatchConfig(), 2).check(ObjectPose(0.0, first), 0.0)
     assert fault == "an object pose of the shape (3,), not (6,): x, y, z, x, y, z"
+
+
+@pytest.mark.parametrize(
+    ("time_s", "now_s", "fault"),
+    [
+        (1.0, 1.099, None),
+        (1.0, 1.12, "the robot's state is 120 ms old"),
+        (1.019, 1.0, None),
+        (1.03, 1.0, "the robot's state is of 30 ms in the future"),
+    ],
+)
+def test_the_age_of_a_state(time_s, now_s, fault):
+    state = RobotState(time_s, np.zeros(3), np.zeros(2))
+    assert watchdogs.StateWatch(watchdogs.WatchConfig()).check(state, now_s) == fault
+
+
+def test_a_state_whose_time_is_no_number_is_a_fault():
+    state = RobotState(float("nan"), np.zeros(3), np.zeros(2))
+    assert "ms old" in watchdogs.StateWatch(watchdogs.WatchConfig()).check(state, 1.0)

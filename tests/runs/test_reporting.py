@@ -299,7 +299,7 @@ def test_a_run_whose_redis_is_killed_and_comes_back(tmp_path, redis, monkeypatch
         warned.extend(status(tmp_path).warnings)
         if metrics["iteration"] == 2:
             redis.kill()
-            time.sleep(0.2)
+            time.sleep(0.7)  # longer than the writer sleeps between two tries
         if metrics["iteration"] == 6:
             redis.revive()
 
