@@ -105,9 +105,9 @@ def read_stages(directory: RunDirectory) -> dict[int, Parameters]:
         TandemError: a snapshot is damaged, or there is no usable checkpoint.
     """
     part = directory.read_config().part
-    store = CheckpointStore(directory.snapshots, keep=1)
+    store = CheckpointStore(directory.snapshots)
     saved = [read_checkpoint(store.path(step)) for step in store.steps()]
-    saved.append(CheckpointStore(directory.checkpoints, keep=1).load_latest())
+    saved.append(CheckpointStore(directory.checkpoints).load_latest())
     stages = {int(each.meta["env_steps"]): split_parts(each.arrays)[part] for each in saved}
     return dict(sorted(stages.items()))  # a killed run may have a snapshot that is newer than its checkpoint
 

@@ -247,7 +247,7 @@ def scratch() -> Iterator[Path]:
 
 def copy_run(source: RunDirectory, home: Path) -> RunDirectory:
     """Copy what a ``Training`` in ``home`` needs to go on from the newest checkpoint of ``source``."""
-    store, target = CheckpointStore(source.checkpoints, keep=1), RunDirectory(home / "runs" / NAME)
+    store, target = CheckpointStore(source.checkpoints), RunDirectory(home / "runs" / NAME)
     if (newest := store.newest()) is None:
         raise TandemError(f"no run with a checkpoint in {source.path}; name one that has one")
     target.checkpoints.mkdir(parents=True)

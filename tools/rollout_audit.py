@@ -114,7 +114,7 @@ def audit_run(
     directory: RunDirectory, end: RunStatus, seen: Sequence[RunStatus], *, late: bool = False
 ) -> dict[str, Any]:
     """Audit a run that has ended, see ``audit_rollouts``, from its directory and the statuses seen on its way."""
-    newest = CheckpointStore(directory.checkpoints, keep=1).load_latest()
+    newest = CheckpointStore(directory.checkpoints).load_latest()
     rows = newest.arrays["learner/counted"].tolist()
     ledger = {(int(actor), int(incarnation)): int(highest) for actor, incarnation, highest in rows}
     return audit_rollouts(read_jsonl(directory.metrics_file), ledger, end, stretches_of([*seen, end]), late=late)

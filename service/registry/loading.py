@@ -404,9 +404,7 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
     if file is not None and not directory.exists:
         raise ConfigError(f"{label} is a file, and no checkpoint of a run: name a run, or a version as NAME@ALIAS")
     config = directory.read_config()
-    saved: Checkpoint = (
-        CheckpointStore(directory.checkpoints, keep=1).load_latest() if file is None else read_checkpoint(file)
-    )
+    saved: Checkpoint = CheckpointStore(directory.checkpoints).load_latest() if file is None else read_checkpoint(file)
     parts, path = split_parts(saved.arrays), file or directory.path
     if config.makes is None or config.part not in parts:
         raise TandemError(f"{label} is a run of the method {config.method}, which makes nothing that can be loaded")

@@ -7,7 +7,6 @@ the method alone, which also says whether an iteration has ended.
 from __future__ import annotations
 
 import logging
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -74,7 +73,7 @@ class Run:
         directory.claim(resume=resume)
         self.config, self.directory = config, directory
         self.checkpoints = CheckpointStore(directory.checkpoints, config.run.keep_checkpoints, epoch=directory.epoch)
-        self._snapshots = CheckpointStore(directory.snapshots, keep=sys.maxsize)
+        self._snapshots = CheckpointStore(directory.snapshots)
         self._saved: int | None = None
         """The iteration of the newest checkpoint; None before the first."""
         self.wall_s = 0.0

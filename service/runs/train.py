@@ -225,7 +225,7 @@ def prepare(
 def _end_now(report: Report, directory: RunDirectory, what: str) -> None:
     """End this process from a thread while Ray is frozen: no call of the main thread may ever come back."""
     try:
-        saved = next(reversed(CheckpointStore(directory.checkpoints, keep=1).steps()), None)
+        saved = next(reversed(CheckpointStore(directory.checkpoints).steps()), None)
         text = f"{what}; " + ("nothing is saved yet" if saved is None else f"--resume goes on from iteration {saved}")
         print(f"error: {text}", file=sys.stderr, flush=True)
         ending = Thread(target=report.__exit__, args=(WorkersError, WorkersError(text), None), daemon=True)
@@ -318,7 +318,7 @@ def publish_learned(
         config = config.model_copy(update=changed)
         check_publishable(config, registry)
         if metrics is None:
-            saved = CheckpointStore(directory.checkpoints, keep=1).load_latest()
+            saved = CheckpointStore(directory.checkpoints).load_latest()
             metrics = _measure(config, learned) | {"env_steps": saved.meta["env_steps"]}
         version = publish_run(directory, Registry(Path(registry)), config, learned.parameters, metrics)
         status, run_id = read_status(path), run_id_of(path)

@@ -35,19 +35,19 @@ class Checkpoint(NamedTuple):
 
 
 class CheckpointStore:
-    """The newest ``keep`` checkpoints of one run in a directory; one writer, any number of readers.
+    """The checkpoints of one run in a directory; one writer, any number of readers.
 
     The newest is that of the highest epoch (``epoch``), and of its checkpoints that of the last step: what a process
     writes that was overtaken by another one is never read.
 
     Args:
         directory: made when missing.
-        keep: how many stay.
+        keep: how many stay when one is saved; None: all.
         epoch: of the process that writes; 0 where there is never more than one.
     """
 
-    def __init__(self, directory: Path, keep: int, *, epoch: int = 0) -> None:
-        assert keep >= 1
+    def __init__(self, directory: Path, keep: int | None = None, *, epoch: int = 0) -> None:
+        assert keep is None or keep >= 1
         self.directory, self.keep, self.epoch = directory, keep, epoch
         self._damaged: set[Path] = set()
 
@@ -84,7 +84,7 @@ class CheckpointStore:
             raise CheckpointError(f"no checkpoint in {self.directory}; name another run, or start without --resume")
 
     def save(self, step: int, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> Path:
-        """Write a checkpoint to the disk, then delete those older than the newest ``keep``.
+        """Write a checkpoint to the disk, then delete those older than the newest ``keep``, if that is given.
 
         Args:
             step: the iteration after which the state was taken, >= 0.
@@ -130,7 +130,7 @@ class CheckpointStore:
         # What another process writes in a higher epoch is not for this one to delete, and a damaged file that was
         # passed over, of whatever epoch and step, must not crowd out a good one.
         files = [path for epoch, step, path in self._files() if (epoch, step) <= (self.epoch, newest)]
-        kept = [path for path in files if path not in self._damaged][-self.keep :]
+        kept = [path for path in files if path not in self._damaged][-(self.keep or 0) :]
         try:
             for path in files[: files.index(kept[0])] if kept else ():  # none where the directory cannot be read
                 path.unlink(missing_ok=True)

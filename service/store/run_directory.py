@@ -227,7 +227,7 @@ class RunDirectory:
         if self._lock is not None:
             return
         if resume:
-            CheckpointStore(self.checkpoints, keep=1).check_any()
+            CheckpointStore(self.checkpoints).check_any()
         else:
             self._check_free()
         self._lock = DirectoryLock(self.path)

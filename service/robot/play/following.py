@@ -72,7 +72,7 @@ class Following:
         Raises:
             TandemError: something is damaged, or goes away while it is read.
         """
-        newest = CheckpointStore(RunDirectory(self._path).checkpoints, keep=1).newest()
+        newest = CheckpointStore(RunDirectory(self._path).checkpoints).newest()
         if newest != self._seen:
             self._players, self._seen = load(str(self._path), *self._from), newest
         recorded = self._reader.columns(self._run_id, SUCCESS)
