@@ -281,7 +281,10 @@ class RunDirectory:
             raise TandemError(f"{self.path} holds a run already; continue it with --resume, or name another --run-dir")
         if (self.path / STUDY_FILE).is_file():
             raise TandemError(f"{self.path} holds a study; name another --run-dir")
-        if self.path.exists() and not (self.path / LOCK_FILE).exists():  # with it, a run tried to begin here
+        tried = (
+            self.path / LOCK_FILE
+        ).exists() or self.checkpoints.is_dir()  # made first; left by a run that was ended
+        if self.path.exists() and not tried:
             with os_errors("read", self.path):
                 others = sorted(each.name for each in self.path.iterdir() if not each.name.startswith(_BEFORE_A_RUN))
             if others:

@@ -114,8 +114,10 @@ def test_what_alice_is_for_by_hand():
     assert len(lines) == 4
     assert why_alice_words(some) == ""
     words = why_alice_words(dict.fromkeys(ARMS, study(0.1, 0.2)) | some)
-    assert "solves 96 %; 50 % if he clones none of her turns, 15 % if she is not paid when he fails" in words
-    assert "15 % with Alice, 15 % with an Alice who never learns, 15 % without Alice" in words
+    assert (
+        "solves 96 % of random goals; 50 % if he clones none of her turns, 15 % if his failures do not pay her" in words
+    )
+    assert "15 % with Alice, 15 % with an Alice who does not learn, 15 % without Alice" in words
 
 
 @pytest.mark.parametrize("name", ARMS)

@@ -12,7 +12,7 @@ from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.rendering.camera import parse_view
 from service.envs.rendering.renderer import RenderError, SceneRenderer
-from service.generator.validity import Verdict
+from service.generator.validity import NO_GOAL, Verdict
 from service.media import encoding, video
 from service.media.recording import RecordedEpisodes, RecordedRound
 from service.media.video import BAR_HEIGHT, FilmOptions, pane_rows, write_episode_video, write_video
@@ -72,7 +72,7 @@ def test_without_a_goal_bob_has_no_turn(tmp_path):
 
 
 def test_the_caption_tells_what_happened():
-    assert set(video._NO_GOAL) == set(Verdict) - {Verdict.VALID}
+    assert set(NO_GOAL) == set(Verdict) - {Verdict.VALID}
     assert (video._bar(200, "Bob", (0, 0, 0), "") != video._bar(200, "Alice", (0, 0, 0), "")).any()
 
 

@@ -66,7 +66,7 @@ def test_a_directory_of_something_else_is_refused(tmp_path):
     with pytest.raises(TandemError) as error:
         directory.claim(resume=False)
     assert_one_line(error.value, tmp_path, "holds no run, but 'notes.md'", "another --run-dir")
-    (tmp_path / ".lock").touch()  # of a run that was killed while it began
+    (tmp_path / "checkpoints").mkdir()  # of a run that a signal ended while it began
     directory.claim(resume=False)
     directory.close()
 

@@ -42,15 +42,15 @@ def test_a_stop_file_stops_a_run_that_tells_redis_too(redis, tmp_path):
 
 
 def test_a_run_whose_id_another_one_has_in_redis_leaves_the_directory_alone(redis, tmp_path):
-    directory = RunDirectory(tmp_path)
+    directory = RunDirectory(tmp_path / "run")
     directory.claim(resume=False)
-    (tmp_path / "stop").touch()
+    (directory.path / "stop").touch()
     other = a_writer(redis.address)
     wait_until(lambda: redis.address.client(1.0).exists(run_key("cube", "heartbeat")))
     with pytest.raises(RunTakenError) as error:
         reporting_to(directory, "cube", redis.address)
     assert_one_line(error.value, "another run with the id cube reports to Redis at", "wait 10 s", "--run-dir")
-    assert (tmp_path / "stop").exists()
+    assert (directory.path / "stop").exists()
     other.close()
     reporting_to(directory, "cube", redis.address).close()
     mine = f"{directory.history.run}:{directory.epoch}".encode()
