@@ -86,7 +86,8 @@ def train(
         on_iteration: called with the metrics of every iteration; what it returns, if anything, ends the run.
 
     Returns:
-        Why and where it ended, metrics of the final evaluation, files that were made, and the published version, if any.
+        Why and where it ended, metrics of the final evaluation, files that were made, and the version if one was
+        published.
 
     Raises:
         TandemError: a setting, a file or a directory that cannot be used.

@@ -47,8 +47,9 @@ from service.base.parsing import parse_json
 from service.base.types import FloatArray, StateArray
 from service.base.version import LEARNING_VERSION, git_commit
 from service.config import Config, dump_config, load_config
+from service.store import run_log
 from service.store.checkpoints import CheckpointStore
-from service.store.models import CONFIG_FILE, GOALS_FILE, METRICS_FILE, OUTPUT_FILE, STUDY_FILE
+from service.store.models import CONFIG_FILE, GOALS_FILE, METRICS_FILE, OUTPUT_FILE, STATUS_FILE, STUDY_FILE
 from service.store.run_history import (
     BEFORE,
     Event,
@@ -67,8 +68,18 @@ MAX_DIVERGED_FILES = 100
 RECORDINGS = "recordings"
 RESULT_FILE = "result.json"
 """What was measured at the end of a run."""
-_BEFORE_A_RUN = (".", TRACEBACK_PREFIX, OUTPUT_FILE)
-"""How names of files begin that may be where a run begins."""
+_BEFORE_A_RUN = (
+    ".",
+    TRACEBACK_PREFIX,
+    OUTPUT_FILE,
+    STATUS_FILE,
+    run_log.FILE,
+    "run.json",
+    "environment.json",
+    "tensorboard",
+    "checkpoints",
+)
+"""How names begin of what may be where a run begins: one that ended before it had begun leaves it."""
 MAX_RECORDINGS = 20
 
 
@@ -281,10 +292,7 @@ class RunDirectory:
             raise TandemError(f"{self.path} holds a run already; continue it with --resume, or name another --run-dir")
         if (self.path / STUDY_FILE).is_file():
             raise TandemError(f"{self.path} holds a study; name another --run-dir")
-        tried = (
-            self.path / LOCK_FILE
-        ).exists() or self.checkpoints.is_dir()  # made first; left by a run that was ended
-        if self.path.exists() and not tried:
+        if self.path.exists() and not (self.path / LOCK_FILE).exists():  # which is left by one that was killed
             with os_errors("read", self.path):
                 others = sorted(each.name for each in self.path.iterdir() if not each.name.startswith(_BEFORE_A_RUN))
             if others:

@@ -57,7 +57,7 @@ def test_a_second_run_is_refused(directory):
 
 
 def test_a_directory_of_something_else_is_refused(tmp_path):
-    for name in (".git", "tandem-error-1.txt", "log.txt"):
+    for name in (".git", "tandem-error-1.txt", "log.txt", "log.jsonl", "status.json"):
         (tmp_path / name).touch()
     directory = RunDirectory(tmp_path)
     directory.claim(resume=False)
@@ -66,7 +66,7 @@ def test_a_directory_of_something_else_is_refused(tmp_path):
     with pytest.raises(TandemError) as error:
         directory.claim(resume=False)
     assert_one_line(error.value, tmp_path, "holds no run, but 'notes.md'", "another --run-dir")
-    (tmp_path / "checkpoints").mkdir()  # of a run that a signal ended while it began
+    (tmp_path / ".lock").touch()  # of a run that was killed while it began
     directory.claim(resume=False)
     directory.close()
 
