@@ -65,7 +65,7 @@ def test_goals_are_its_own_and_in_the_workspace(file):
         ("goal[:, 0])]", "goal[:, None])]", "corner.py: known.near: goal has shape ("),
         ("known.near(", "known.far(", "corner.py:8: AttributeError: "),
         ("(learnability > 0.0)", "np.nan", "Corner.weights gave nan at [0] of shape ("),
-        ("(learnability > 0.0)", "-learnability", "; give weights of 0 or more"),
+        ("(learnability > 0.0)", "-learnability", "Corner.weights gave -0.25 at [0]; give weights of 0 or more"),
         ("(learnability > 0.0)", "learnability[:, None]", "Corner.weights gave float64 of shape ("),
         ("def goals", "def gaols", "corner.py: TypeError: Can't instantiate abstract class Corner"),
         ("Corner(GoalSource)", "Corner", "corner.py: it has to define one class that derives from GoalSource, and has"),
