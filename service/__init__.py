@@ -26,7 +26,7 @@ __all__ = ["evaluate", "load", "make_env", "train"]
 
 
 def load(
-    reference: str = "panda-cube@champion",
+    reference: Path | str = "panda-cube@champion",
     registry: Path | str | None = None,
     primitives: str | None = None,
     *,
@@ -39,8 +39,9 @@ def load(
             exported version. ``panda-cube@champion`` comes with the package.
         registry: directory to look in first, by default TANDEM_REGISTRY or ``registry``; a version or alias it does not
             have is looked up among what comes with the package. Or the ``http://HOST:PORT`` of a ``tandem serve``,
-            which alone is asked, with the token in TANDEM_TOKEN. What a policy of a task acts with is looked up there,
-            too, by the version that it was trained with, and among what comes with the package.
+            which alone is asked, with the token in TANDEM_TOKEN if TANDEM_URL or TANDEM_REGISTRY names that service.
+            What a policy of a task acts with is looked up there, too, by the version that it was trained with, and
+            among what comes with the package.
         primitives: what a policy of a task acts with, where that has moved. The parameters have to be those it was
             trained with.
         run_task_code: run what code the task of a published policy brings; acting needs none. The directory of a run
@@ -114,13 +115,18 @@ def train(
 
 
 def evaluate(
-    trained: Trained, task: str | None = None, *, goals: GoalKind | None = None, num_episodes: int = 300, seed: int = 0
+    trained: Trained,
+    task: str | Task | None = None,
+    *,
+    goals: GoalKind | None = None,
+    num_episodes: int = 300,
+    seed: int = 0,
 ) -> Evaluation:
     """Measure a policy without noise on random goals, as ``tandem evaluate`` does.
 
     Args:
         trained: as ``load`` gives it.
-        task: to be played in place of its own, by name or file.
+        task: to be played in place of its own, by name or file, or an object.
         goals: ``table``, ``air``, ``volume``, ``mixed`` or ``one`` in place of the task's.
         num_episodes: each from a fresh reset.
         seed: of the episodes.
@@ -137,7 +143,7 @@ def evaluate(
 
     if num_episodes < 1:
         raise ValueError(f"num_episodes = {num_episodes}; give at least 1")
-    on = trained.on(task)
+    on = trained.on(task) if task is None or isinstance(task, str) else trained.playing(task)
     first_seed = seed if on.task is None else seed + FINAL_SEED
     return evaluation.evaluate(
         on.player(), on.world, on.on_goals(goals), num_episodes=num_episodes,

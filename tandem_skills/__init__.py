@@ -22,6 +22,7 @@ if not hasattr(service, "make_env"):
 from service.envs.gym import registration as _registration  # noqa: F401 - gymnasium.make finds what it registers
 
 if TYPE_CHECKING:
+    from service import __version__ as __version__
     from service import evaluate as evaluate
     from service import load as load
     from service import make_env as make_env
@@ -66,6 +67,7 @@ _PLACES = {
     "GoalSource": "service.generator.sources",
     "Known": "service.generator.sources",
     "IntrinsicReward": "service.methods.intrinsic_reward",
+    "__version__": "service",
 }
 """Modules of the names, which are imported when they are asked for."""
 __all__ = list(_PLACES)

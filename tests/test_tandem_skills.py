@@ -44,6 +44,8 @@ def test_another_service_is_named(tmp_path):
 
 def test_a_policy_is_evaluated_in_an_environment_and_as_the_command_does(champion):
     found = tandem_skills.evaluate(champion, "push", num_episodes=5, seed=3)
+    again = tandem_skills.evaluate(champion, tandem_skills.find_task("push"), num_episodes=5, seed=3)
+    assert (again.success_last, again.num_steps) == (found.success_last, 50)
     assert (found.num_episodes, found.num_steps, found.goals) == (5, 50, "table")
     envs = tandem_skills.make_env("push", champion, num_envs=2)
     observation, _ = envs.reset(seed=0)

@@ -166,7 +166,8 @@ def checked(where: str, given: Array, shape: tuple[int, ...], *, truth: bool = F
     Raises:
         CodeError: it is something else.
     """
-    fits = given.dtype == np.bool_ if truth else given.dtype == np.bool_ or np.issubdtype(given.dtype, np.number)
+    is_real = np.issubdtype(given.dtype, np.integer) or np.issubdtype(given.dtype, np.floating)
+    fits = given.dtype == np.bool_ or (is_real and not truth)
     if given.shape != shape or not fits:
         wanted = f"{'bool' if truth else 'float'} of shape {shape}"
         raise CodeError(f"{where} gave {given.dtype} of shape {given.shape}; give {wanted}")

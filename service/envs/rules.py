@@ -17,6 +17,7 @@ from service.envs.sampling import (
     GoalKind,
     check_goals,
     draw_goals,
+    inside_box,
     inside_each_other,
     inside_fixtures,
     inside_gripper_or_table,
@@ -103,15 +104,15 @@ class Rules:
     def _places(self, name: str, rng: np.random.Generator, worlds: slice) -> StateArray:
         """(N, 3 K) places by a function of the task; drawn again where they are out of reach, or inside something."""
         batch = self._worlds
-        config, obstacles = batch.config, batch.places.of(worlds).obstacles
+        config = batch.config
         view = self.view(batch.object_position).of(worlds)
         place, wrong = view.goal.reshape(len(view.goal), -1).copy(), np.ones(len(view.goal), dtype=bool)
         for _ in range(_MAX_DRAWS):
             asked = view.of(wrong)
             found = self._asked(name, asked.objects.place.shape, asked, rng)
             place[wrong] = found.reshape(len(found), -1)
-            wrong = self.out_of_reach(place) | inside_fixtures(place, config)
-            wrong |= inside_obstacles(place, obstacles, config) | inside_each_other(place, config)
+            wrong = self.out_of_reach(place) | inside_fixtures(place, config) | inside_each_other(place, config)
+            wrong |= self.inside_things(place, worlds, bottom=name == "starts")
             if name == "starts":
                 # It may know heights as they are in its world, or as the configuration has them.
                 rest_m = np.minimum(config.rest_heights_m, batch.rest_heights[worlds])
@@ -157,6 +158,15 @@ class Rules:
         reached = self._worlds.reach.clip(raised)
         reached[:, 2] = np.minimum(raised[:, 2], self._worlds.reach.height[-1])
         return reached.reshape(goal.shape)
+
+    def inside_things(self, place: StateArray, worlds: slice = _ALL, *, bottom: bool = False) -> BoolArray:
+        """(N,) whether objects at (N, 3 K), metres, would be inside what is elsewhere in every game.
+
+        That is an obstacle, or a side of a box, or its ``bottom``, too.
+        """
+        batch, there = self._worlds, self._worlds.places.of(worlds)
+        in_box = inside_box(place, there.box, batch.config, bottom=bottom)
+        return in_box | inside_obstacles(place, there.obstacles, batch.config)
 
     def out_of_reach(self, goal: StateArray) -> BoolArray:
         """(N,) whether the arm brings an object not as near to its place of (N, 3 K) goals as counts."""

@@ -388,10 +388,27 @@ def inside_obstacles(position: StateArray, obstacles: StateArray, config: WorldC
 def inside_fixtures(position: StateArray, config: WorldConfig) -> BoolArray:
     """(N,) whether an object at its place of (N, 3 K) would be more than a millimetre inside a fixture or the wall.
 
-    A box, which is elsewhere in every game, is none of them.
+    A box, which is elsewhere in every game, is none of them: see ``inside_box``.
     """
     fixtures = _around_fixtures(config)
     return _some_object(position, config, lambda around: _overlap(_smaller(around), fixtures))
+
+
+def inside_box(position: StateArray, box: StateArray, config: WorldConfig, *, bottom: bool) -> BoolArray:
+    """(N,) whether an object at its place of (N, 3 K) would be more than a millimetre inside a side of a box.
+
+    Args:
+        position: metres.
+        box: (N, 3) the middle of its bottom; (N, 0) in worlds without.
+        config: the world.
+        bottom: whether it must not be inside the bottom, either; goals are (``draw_goals``).
+    """
+    if not box.size:
+        return np.zeros(len(position), dtype=bool)
+    parts = scene.BOX_PARTS if bottom else scene.BOX_PARTS[1:]
+    middle, half = (np.array([part[number] for part in parts]) for number in (1, 2))
+    shell = Boxes(box[:, None] + middle - half, box[:, None] + middle + half)
+    return _some_object(position, config, lambda around: _overlap(_smaller(around), shell))
 
 
 def inside_each_other(position: StateArray, config: WorldConfig) -> BoolArray:

@@ -31,6 +31,15 @@ BOX_SIZE_M = 0.10
 BOX_HEIGHT_M = 0.05
 BOX_SHELL_M = 0.005
 """Thickness of its walls and bottom; paper: 10 x 10 x 5 cm, taken as the outside."""
+_SHELL_M, _HEIGHT_M, _SIDE_M = BOX_SHELL_M / 2, BOX_HEIGHT_M / 2, (BOX_SIZE_M - BOX_SHELL_M) / 2
+BOX_PARTS = (
+    ("bottom", (0.0, 0.0, _SHELL_M), (BOX_SIZE_M / 2, BOX_SIZE_M / 2, _SHELL_M)),
+    ("near", (-_SIDE_M, 0.0, _HEIGHT_M), (_SHELL_M, BOX_SIZE_M / 2, _HEIGHT_M)),
+    ("far", (_SIDE_M, 0.0, _HEIGHT_M), (_SHELL_M, BOX_SIZE_M / 2, _HEIGHT_M)),
+    ("left", (0.0, -_SIDE_M, _HEIGHT_M), (BOX_SIZE_M / 2 - BOX_SHELL_M, _SHELL_M, _HEIGHT_M)),
+    ("right", (0.0, _SIDE_M, _HEIGHT_M), (BOX_SIZE_M / 2 - BOX_SHELL_M, _SHELL_M, _HEIGHT_M)),
+)
+"""Name, middle and half size of the parts of the box, metres from the middle of its bottom; the bottom is first."""
 GAP_M = 0.005
 """Least distance of a new object from wall or box."""
 FINGER_GAP_M = 0.04
@@ -137,15 +146,7 @@ def _add_fixture(spec: mujoco.MjSpec, config: WorldConfig) -> None:
         _add_fixed(spec.worldbody, "wall", config, type=mujoco.mjtGeom.mjGEOM_BOX, pos=middle, size=half)
     elif config.fixture == "box":
         box = spec.worldbody.add_body(name="box", pos=(workspace.center_x_m, workspace.center_y_m, 0.0), mocap=True)
-        outer, shell, height = BOX_SIZE_M / 2, BOX_SHELL_M / 2, BOX_HEIGHT_M / 2
-        side, inner = outer - shell, outer - BOX_SHELL_M
-        for name, middle, half in (
-            ("bottom", (0.0, 0.0, shell), (outer, outer, shell)),
-            ("near", (-side, 0.0, height), (shell, outer, height)),
-            ("far", (side, 0.0, height), (shell, outer, height)),
-            ("left", (0.0, -side, height), (inner, shell, height)),
-            ("right", (0.0, side, height), (inner, shell, height)),
-        ):
+        for name, middle, half in BOX_PARTS:
             _add_fixed(box, name, config, type=mujoco.mjtGeom.mjGEOM_BOX, pos=middle, size=half)
 
 

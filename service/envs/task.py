@@ -7,7 +7,8 @@ and ``remember``. ``service.envs.rules`` applies one to worlds that are played.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -141,6 +142,9 @@ class Task:
             raise ValueError(f"task {self.title}: world = {self.world!r}: give a mapping of settings")
         if not isinstance(self.goals, str) and not callable(self.goals):
             raise ValueError(f"task {self.title}: goals is a {type(self.goals).__name__}: give a kind, or a function")
+        for name in ("starts", "success", "reward", "remember"):
+            if (given := getattr(self, name)) is not None and not callable(given):
+                raise ValueError(f"task {self.title}: {name} is a {type(given).__name__}: give a function, or None")
         if type(self.episode_steps) is not int or type(self.memory_size) is not int:
             raise ValueError(
                 f"task {self.title}: episode_steps = {self.episode_steps!r}, memory_size = {self.memory_size!r}: "
@@ -156,6 +160,15 @@ class Task:
                 f"task {self.title}: remember gives the memory, and memory_size says how many numbers: give both, or "
                 "none of them"
             )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle a task of a user's file as its text and what was changed: others find no module with its functions."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        if not self.code:
+            return partial(Task, **values), ()
+        found = _found_again(self.name, self.code, {})
+        changes = {name: value for name, value in values.items() if value is not getattr(found, name)}
+        return _found_again, (self.name, self.code, changes)
 
     @property
     def id(self) -> str:
@@ -195,6 +208,12 @@ class Task:
 
         kept = {key: getattr(self, key) for key in ("title", "description", "episode_steps", "version", "name")}
         return {**kept, "world": to_jsonable_python(dict(self.world), fallback=float), "goals": self.goal_kind}
+
+
+def _found_again(name: str, code: Mapping[str, str], changes: Mapping[str, Any]) -> Task:
+    from service.envs.tasks import find_task
+
+    return replace(find_task(name, code), **changes)
 
 
 class _NotGiven(NDArrayOperatorsMixin):

@@ -19,6 +19,7 @@ import numpy as np
 
 from service.base.errors import TandemError
 from service.base.types import FloatArray
+from service.config import WorldConfig
 from service.envs.observations import layouts
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.registry.learned import compose_actions
@@ -93,6 +94,14 @@ class _ComposingWrapper:
                 f"{self.primitives.num_positions} positions of service.envs.observations: give positions=, which takes "
                 "them out of an observation"
             )
+        world = getattr(self.env.unwrapped, "config", None)
+        if positions is None and isinstance(primitives, Trained) and isinstance(world, WorldConfig):
+            there, known = (layouts(each).positions.columns for each in (world, primitives.config.world))
+            if there != known:
+                raise TandemError(
+                    f"{primitives.label} sees {', '.join(known)}, and the environment shows {', '.join(there)}: name "
+                    "primitives of such a world"
+                )
         self._take = positions or (operator.itemgetter("observation") if named else lambda observation: observation)
         self._low, self._high = action_space.low, action_space.high
         self._num_actions = self.primitives.num_primitives + (self.primitives.action_size if residual else 0)
@@ -169,6 +178,14 @@ class ComposePrimitives(
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
         """The environment's own, where it has goals: hindsight relabelling asks for it here."""
         return self.env.get_wrapper_attr("compute_reward")(achieved_goal, desired_goal, info)
+
+    def state(self) -> Any:
+        """The environment's own, where it can be saved; composing has none."""
+        return self.env.get_wrapper_attr("state")()
+
+    def restore(self, state: Any) -> Any:
+        """Go back to a saved state, and return the observation there: the next composition acts on it."""
+        return self._observe(self.env.get_wrapper_attr("restore")(state))
 
 
 class ComposePrimitivesVector(_ComposingWrapper, gymnasium.vector.VectorWrapper[Any, FloatArray, Any, FloatArray, Any]):

@@ -126,13 +126,14 @@ class NumpyMCPPolicy(NumpyPolicy):
         """Mean and std, (..., A) each, of the primitives at (..., P) positions under given (..., K) weights.
 
         Raises:
-            PolicyError: the last axis is not P, or not K.
+            PolicyError: the last axis is not P, or not K; a weight below 0, or all of a row 0.
         """
         weights = np.asarray(weights, dtype=np.float32)
         if weights.shape[-1:] != (self.num_primitives,):
             raise PolicyError(f"weights: expected shape (..., {self.num_primitives}), got {weights.shape}")
-        mean, variance = forward.compose(weights, *self.primitives(positions))
-        return mean, np.sqrt(variance)
+        if not (weights.min(initial=0.0) >= 0.0 and (weights.max(axis=-1) > 0.0).all()):
+            raise PolicyError("weights: give numbers of at least 0, and in each row one above 0")
+        return self._compose(positions, weights)
 
     def distribution(self, observation: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and std, (..., A) each, of the composition at (..., O) observations.
@@ -140,8 +141,11 @@ class NumpyMCPPolicy(NumpyPolicy):
         Raises:
             PolicyError: the observation's last axis is not O.
         """
-        weights = self.gate(observation)
-        return self.compose(np.asarray(observation)[..., : self.num_positions], weights)
+        return self._compose(np.asarray(observation)[..., : self.num_positions], self.gate(observation))
+
+    def _compose(self, positions: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+        mean, variance = forward.compose(weights, *self.primitives(positions))
+        return mean, np.sqrt(variance)
 
 
 def numpy_bob(parameters: Parameters) -> NumpyPolicy:

@@ -66,7 +66,7 @@ def compose_actions(
     """
     mean, _ = primitives.compose(positions, action_weights(actions[..., : primitives.num_primitives]))
     if residual:
-        mean += np.float32(residual) * actions[..., primitives.num_primitives :]
+        mean += np.float32(residual) * np.clip(actions[..., primitives.num_primitives :], -1.0, 1.0)
     return mean
 
 

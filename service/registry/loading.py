@@ -6,6 +6,7 @@ Acting is NumPy: nothing here needs torch.
 
 from __future__ import annotations
 
+import copy
 import functools
 import hashlib
 import logging
@@ -123,7 +124,10 @@ class Trained:
     @property
     def nominal(self) -> Trained:
         """The same in the world without ``world.randomisation``."""
-        return replace(self, config=self.config.model_copy(update={"world": self.config.world.nominal}))
+        config, task = self.config.model_copy(update={"world": self.config.world.nominal}), self.task
+        if task is not None:
+            task = replace(task, world={key: value for key, value in task.world.items() if key != "randomisation"})
+        return replace(self, config=config, task=task)
 
     @property
     def tried_on(self) -> Task:
@@ -202,17 +206,20 @@ class Trained:
             begin()
 
     def act_deterministic(self, observation: FloatArray) -> FloatArray:
-        """Compute (N, 4) actions from (N, O) positions and goal, such as (N, 14), metres. Bob takes (O,), too.
+        """Compute (N, 4) actions in [-1, 1] from (N, O) positions and goal, such as (N, 14), metres.
+
+        Bob takes (O,), too.
 
         Raises:
             PolicyError: another shape; of a policy of a task another N than in the step before, without ``begin``.
         """
-        return self.policy.act_deterministic(observation)
+        return np.clip(self.policy.act_deterministic(observation), -1.0, 1.0)
 
     def player(self) -> DeterministicPolicy:
-        """The policy, at the start of new episodes."""
-        self.begin()
-        return self.policy
+        """A copy of the policy, at the start of new episodes: those that this one plays go on."""
+        played = replace(self, policy=copy.copy(self.policy))
+        played.begin()
+        return played.policy
 
     def on(self, task: str | None) -> Trained:
         """Return a copy that plays a task, by its name or file, without Alice; None: itself.
@@ -281,14 +288,14 @@ class Trained:
 
 
 def load(
-    reference: str,
+    reference: Path | str,
     registry: Path | str = "registry",
     primitives: str | None = None,
     *,
     run_task_code: bool = False,
 ) -> Trained:
     """Load what was trained; see ``service.load``."""
-    path = Path(reference)
+    path, reference = Path(reference), str(reference)
     is_place = path.is_dir() or "/" in reference or (path.suffix == ".safetensors" and path.is_file())
     if is_exported(path) or not is_place:
         found = _load_version(reference, registry, primitives, run_task_code=run_task_code)
@@ -324,7 +331,7 @@ def _task_of(spaces: Mapping[str, Any], manifest: Manifest, label: str, *, run_c
     if run_code:
         if not isinstance(code, dict) or not isinstance(code.get(reference.origin), str):
             raise TandemError(f"{label}: its manifest lacks the text of {reference.origin}; publish it again")
-        return find_task(name, code)
+        return find_task(name, code, cast("Any", manifest.config.get("task_world")))
     why = (
         f"{label}: what counts is said by code of its publisher, {name}; read it in the manifest, then give "
         "--run-task-code"

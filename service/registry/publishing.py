@@ -156,7 +156,7 @@ def _described(config: Config) -> dict[str, Any]:
             "primitives": config.primitives,
             "primitives_digest": config.primitives_digest,
         }
-        if (task := find_task(config.task, config.code)).code:
+        if (task := find_task(config.task, config.code, config.task_world)).code:
             spaces["own_task"] = task.data()
         return {
             "spaces": spaces,

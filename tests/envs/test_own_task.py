@@ -187,6 +187,7 @@ def test_reward_of_places_alone():
         ({"success": lambda s: True}, "success gave bool of shape (); give bool of shape (2,)"),
         ({"success": lambda s: s.goal[:, 1, 0] > 0}, "IndexError: index 1 is out of bounds"),
         ({"reward": lambda s: s.gripper}, "reward gave float64 of shape (2, 3); give float of shape (2,)"),
+        ({"reward": lambda s: s.fingers + 1j}, "reward gave complex128 of shape (2,); give float of shape (2,)"),
         ({"reward": lambda s: s.fingers / 0.0}, "reward gave inf at [0] of shape (2,); give finite numbers"),
         ({"goals": lambda s, rng: s.gripper}, "goals gave float64 of shape (1, 3); give float of shape (1, 1, 3)"),
         ({"remember": lambda s: s.memory[:, :1], "memory_size": 2}, "remember gave float64 of shape (2, 1)"),
@@ -207,7 +208,15 @@ def test_what_a_function_gives_is_checked(changes, said):
 
 
 @pytest.mark.parametrize(
-    "numbers", [{"episode_steps": 0}, {"memory_size": -1}, {"memory_size": 1}, {"remember": lambda s: s.memory}]
+    "numbers",
+    [
+        {"episode_steps": 0},
+        {"memory_size": -1},
+        {"memory_size": 1},
+        {"remember": lambda s: s.memory},
+        {"success": "table"},
+        {"starts": np.zeros(3)},
+    ],
 )
 def test_numbers_that_no_task_has(numbers):
     with pytest.raises(ValueError, match="task Mine: ") as error:

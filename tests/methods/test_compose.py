@@ -100,6 +100,29 @@ def test_a_residual_is_added_to_the_mean(trained):
     env.close()
 
 
+def test_a_residual_is_no_more_than_it_says(trained):
+    recorder = Recorder(TabletopEnv(CONFIG))
+    env = ComposePrimitives(recorder, trained, residual=0.1)
+    for number in (1.0, 9.0):
+        env.reset(seed=0)
+        env.step(np.concatenate((np.zeros(NUM_PRIMITIVES), np.full(4, number))).astype(np.float32))
+    np.testing.assert_array_equal(*recorder.actions)
+    env.close()
+
+
+def test_a_restored_state_continues_bit_identically(trained):
+    env = ComposePrimitives(gymnasium.make("tandem/Push-v1", config=CONFIG, max_episode_steps=-1), trained)
+    env.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (6, NUM_PRIMITIVES)).astype(np.float32)
+    for action in actions:
+        env.step(action)
+    state = env.state()
+    expected = [env.step(action)[0]["observation"] for action in actions]
+    env.restore(state)
+    np.testing.assert_array_equal([env.step(action)[0]["observation"] for action in actions], expected)
+    env.close()
+
+
 def test_equal_weights_are_one_composition(env):
     ends = []
     for value in (-0.7, 0.9):
@@ -196,6 +219,15 @@ class TestBadInput:
         ours = ComposePrimitives(env, trained, positions=lambda flat: flat[-POSITIONS:])
         ours.reset(seed=0)
         ours.step(np.zeros(NUM_PRIMITIVES, dtype=np.float32))
+        env.close()
+
+    def test_an_environment_that_shows_as_many_other_positions(self):
+        two = service.load("panda-two-cubes@champion", registry="no registry here")
+        obstacle = {"shape": "box", "size_m": (0.04, 0.04, 0.04)}
+        world = WorldConfig(obstacles=[obstacle] * 2, observed={"obstacles": True})
+        env = TabletopEnv(world)
+        assert env.observation_space["observation"].shape == (two.primitives.num_positions,)
+        self.refused(r"panda-two-cubes@\d+ .* sees .*, and the environment shows .*obstacle", env, two)
         env.close()
 
     @pytest.mark.parametrize("residual", [-0.1, 1.5, float("nan")])

@@ -1,10 +1,17 @@
 """A task from a user's file goes the way of ours: trained, killed, resumed, evaluated, published, loaded."""
 
+import dataclasses
+import pickle
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
 from service.base.errors import TandemError
 from service.config import load_config
+from service.envs.gym.vector import TabletopVectorEnv
+from service.envs.task import Task
 from service.envs.tasks import find_task
 from service.methods import task_check
 from service.methods.task_check import check_task
@@ -103,11 +110,35 @@ def test_a_mesh_of_its_world_is_recorded_as_it_was_when_the_run_began(file, tmp_
     train(begun(registry), RunDirectory(path), registry, publish=False, on_iteration=lambda _: None)
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    assert load(str(path), registry).on(None).world.shape.extent_m == pytest.approx((0.06, 0.04, 0.04))
+    found = load(path, registry)
+    version = str(publish(Registry(registry), found.config, found.parameters, {}))
+    worlds = [found.world, *(load(version, registry, run_task_code=run).world for run in (False, True))]
+    for world in worlds:
+        assert world.shape.extent_m == pytest.approx((0.06, 0.04, 0.04))
     write_box(tmp_path / "brick.obj", (0.1, 0.02, 0.02))
-    code, told = evaluated(path, registry)[::-1]
-    assert "brick.obj" in told
-    assert code == 2
+    for reference, *more in ((path,), (version, "--run-task-code")):
+        told, code = evaluated(reference, registry, *more)
+        assert "brick.obj" in told
+        assert code == 2
+
+
+def test_another_process_gets_a_task_with_its_functions(file, tmp_path):
+    (tmp_path / "pickled").write_bytes(pickle.dumps(dataclasses.replace(find_task("stay_near.py"), episode_steps=9)))
+    file.unlink()
+    lines = (
+        "import pickle, sys, numpy as np",
+        "from service.envs.gym.vector import TabletopVectorEnv",
+        "task = pickle.load(open(sys.argv[1], 'rb'))",
+        "env = TabletopVectorEnv(2, task=task, num_threads=1)",
+        "print(task.episode_steps, task.name, env.reset(seed=0)[0]['desired_goal'].tolist())",
+    )
+    command = (sys.executable, "-c", "\n".join(lines), str(tmp_path / "pickled"))
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    env = TabletopVectorEnv(
+        2, task=Task("Same", goals=lambda s, rng: s.objects.place + np.array([0.0, 0.06, 0.0])), num_threads=1
+    )
+    assert told == f"9 stay_near.py {env.reset(seed=0)[0]['desired_goal'].tolist()}\n"
+    env.close()
 
 
 def test_primitives_that_moved_are_named_at_a_resume(file, tmp_path):

@@ -163,6 +163,20 @@ def test_inputs_of_a_wrong_size_are_refused() -> None:
         numpy_policy.compose(np.zeros((5, 11), dtype=np.float32), np.ones((5, 3), dtype=np.float32))
 
 
+@pytest.mark.parametrize(
+    "weights", [[[1, 1, 1, 1], [0, 0, 0, 0]], [[1, 1, 1, 1], [1, 1, 1, -1]], [[1, 1, 1, np.nan]] * 2]
+)
+def test_weights_that_make_no_gaussian_are_refused(weights: list[list[float]]) -> None:
+    numpy_policy = NumpyMCPPolicy(export_parameters(make_bob(PolicyConfig())))
+    positions = np.zeros((2, 11), dtype=np.float32)
+    with pytest.raises(PolicyError, match="weights: give numbers of at least 0, and in each row one above 0"):
+        numpy_policy.compose(positions, np.float32(weights))
+    mean, std = numpy_policy.compose(positions, np.float32([[1, 0, 0, 0]] * 2))
+    means, variances = numpy_policy.primitives(positions)
+    np.testing.assert_allclose(mean, means[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(std, np.sqrt(variances[:, 0]), rtol=1e-6)
+
+
 def test_a_file_of_parameters_runs_no_code(tmp_path: Path) -> None:
     np.savez(tmp_path / "network.npz", function=np.array([print], dtype=object))
     with pytest.raises(ValueError, match="allow_pickle"):

@@ -11,6 +11,7 @@ import pytest
 
 from service.base.errors import TandemError
 from service.envs.observations import BOB, PAPER
+from service.envs.task import Task
 from service.export.exporting import export
 from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy
 from service.registry.bundled import BUNDLED
@@ -51,7 +52,7 @@ def observations(size):
 
 def test_the_newest_bob_of_a_run_directory(run, tmp_path):
     path, learner = run
-    bob = load(str(path), tmp_path)
+    bob = load(path, tmp_path)
     assert bob.label == str(path)
     assert bob.manifest is None
     assert bob.config == tiny_config(total_env_steps=400, checkpoint_interval=1)
@@ -185,6 +186,33 @@ def kinds(tmp_path):
         "task": load(str(tmp_path / "ours"), registry.root),
         "alone": load(str(tmp_path / "scratch-monolithic"), registry.root),
     }
+
+
+def test_an_evaluation_leaves_the_episodes_that_somebody_plays(kinds):
+    for kind, size in (("task", 22), ("skills", BOB.size)):
+        rows = observations(size)
+        playing, alone = kinds[kind], kinds[kind].player()
+        playing.begin()
+        for each in (playing, alone):
+            each.act_deterministic(rows)
+        playing.player().act_deterministic(rows[:2] + 1.0)
+        expected = np.clip(alone.act_deterministic(rows + 0.1), -1.0, 1.0)
+        np.testing.assert_array_equal(playing.act_deterministic(rows + 0.1), expected)
+
+
+def test_actions_are_within_their_bounds(champion):
+    rows = np.concatenate((observations(BOB.size), 9.0 * observations(BOB.size)))
+    raw, given = champion.policy.act_deterministic(rows), champion.act_deterministic(rows)
+    assert np.abs(raw).max() > 1.0
+    np.testing.assert_array_equal(given, np.clip(raw, -1.0, 1.0))
+
+
+def test_the_nominal_world_of_a_task_draws_nothing(kinds):
+    task = Task("Heavy", world={"randomisation": {"object_mass_kg": (0.05, 0.3)}, "friction": 0.7})
+    drawn = kinds["primitives"].playing(task)
+    assert drawn.world.randomisation.model_ranges == {"object_mass_kg": (0.05, 0.3)}
+    assert drawn.nominal.world.randomisation.model_ranges == {}
+    assert drawn.nominal.world.friction == 0.7
 
 
 def test_what_each_kind_has(kinds):

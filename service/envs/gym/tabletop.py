@@ -64,6 +64,10 @@ class GoalWorlds:
         success_distance_m: float,
     ) -> None:
         self.config = config or WorldConfig()
+        if not isinstance(self.config, WorldConfig):
+            raise TandemError(
+                f"config is a {type(config).__name__}: give a WorldConfig, such as load(...).config.world, or None"
+            )
         asked = find_task(task) if isinstance(task, str) else task
         if asked is None:
             asked = Task("Tabletop", goals=self.config.usual_goals)
@@ -76,6 +80,7 @@ class GoalWorlds:
         """What the task says, and what it remembers."""
         self._goal = self._worlds.object_position.copy()
         self._random = [seeding.np_random()[0] for _ in range(num_worlds)]
+        self._has_begun = False
 
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> Any:
         """Compute (...) float64 rewards of (..., 3 K) achieved for (..., 3 K) desired goals, metres, as the task pays.
@@ -83,8 +88,12 @@ class GoalWorlds:
         ``info`` is there for the convention of goal environments and is not read.
 
         Raises:
-            TandemError: the task needs more than places, or gives something else.
+            TandemError: goals of another shape; or the task needs more than places, or gives something else.
         """
+        size = self._goal.shape[1]
+        for name, goal in (("achieved_goal", achieved_goal), ("desired_goal", desired_goal)):
+            if np.shape(goal)[-1:] != (size,):
+                raise TandemError(f"compute_reward: {name} has shape {np.shape(goal)}, not (..., {size}): give metres")
         achieved, desired = np.broadcast_arrays(achieved_goal, desired_goal)
         flat = (each.reshape(-1, each.shape[-1]) for each in (achieved, desired))
         return self.rules.reward(view_of_places(*flat)).reshape(achieved.shape[:-1])
@@ -102,6 +111,9 @@ class GoalWorlds:
     def restore(self, state: EnvState) -> Observation:
         """Go back to a saved state, of this or another environment of the same config; continues bit-identically.
 
+        What wraps the environment does not go back: a time limit of ``gymnasium.make`` counts on
+        (``max_episode_steps=-1`` is none), and ``ComposePrimitives`` has a ``restore`` of its own.
+
         Returns:
             The observation there.
 
@@ -111,6 +123,7 @@ class GoalWorlds:
         if state.worlds.shape != self._worlds.states.shape:
             raise ValueError(f"states: expected shape {self._worlds.states.shape}, got {state.worlds.shape}")
         self._worlds.restore(state.worlds)
+        self._has_begun = True
         self._goal = state.goal.copy()
         self.rules.elapsed, self.rules.memory = state.elapsed.copy(), state.memory.copy()
         for generator, random in zip(self._random, state.random, strict=True):
@@ -122,8 +135,12 @@ class GoalWorlds:
 
         Args:
             worlds: (N,) where.
-            goal: (N, 3 K) in place of random goals, metres; random numbers go on as with these.
+            goal: (N, 3 K) or (1, 3 K) in place of random goals, metres; random numbers go on as with these.
+
+        Raises:
+            TandemError: an object at its given goal would be inside something.
         """
+        self._has_begun = True
         index = np.flatnonzero(worlds).tolist()
         starts = [self._worlds.draw_starts(self._random[world], 1) for world in index]
         self._worlds.restore(np.concatenate(starts), worlds)
@@ -133,6 +150,12 @@ class GoalWorlds:
             self.rules.place(self._random[world], here)
             self._goal[here] = self.rules.draw(self._random[world], here)
         if goal is not None:
+            goal = np.broadcast_to(goal, self._goal.shape)
+            for bad in goal[self.rules.inside_things(goal)]:
+                raise TandemError(
+                    f"reset: options['goal'] ({in_metres(bad)}) m: an object would be inside an obstacle, or a side of "
+                    "the box, where these are in this episode"
+                )
             self._goal[:] = goal
 
     def _given(self, options: dict[str, Any] | None) -> StateArray | None:
@@ -145,7 +168,11 @@ class GoalWorlds:
             raise TandemError(f"reset: unknown option {name!r}; the only one is goal")
         if not options or options["goal"] is None:
             return None
-        goal, num, size = np.array(options["goal"], dtype=np.float64), self._worlds.num_worlds, self._goal.shape[1]
+        try:
+            goal = np.array(options["goal"], dtype=np.float64)
+        except (TypeError, ValueError):
+            raise TandemError(f"reset: options['goal'] = {options['goal']!r}: give numbers, metres") from None
+        num, size = self._worlds.num_worlds, self._goal.shape[1]
         if goal.shape not in ((size,), (num, size)):
             raise TandemError(
                 f"reset: options['goal'] has shape {goal.shape}, not {(size,)} or {(num, size)}: give metres"
@@ -167,6 +194,8 @@ class GoalWorlds:
 
     def _advance(self, actions: FloatArray) -> BoolArray:
         """Act by (N, 4) actions; (N,) whose physics diverged."""
+        if not self._has_begun:
+            raise gymnasium.error.ResetNeeded("call reset before step")
         diverged = self._worlds.step(np.asarray(actions, dtype=np.float32))
         self.rules.advance(self._goal)
         return diverged
@@ -205,8 +234,9 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
       arm covers about 3 cm in a step), change of the finger width (1 is 10 cm).
     - reward: 1 at every step each object is within ``success_distance_m`` of its goal, else 0 (paper, downstream
       tasks); or what the task says.
-    - never terminates; truncated where the physics diverged, or the steps of the task are over. Another
-      length: ``task=replace(find_task("push"), episode_steps=100)``.
+    - never terminates; truncated where the physics diverged, or the steps of the task are over. Another length:
+      ``gymnasium.make("tandem/Push-v1", max_episode_steps=100)``, with -1 for no end; or
+      ``TabletopEnv(task=replace(find_task("push"), episode_steps=100))``.
 
     ``info`` holds ``is_success`` (bool) and, after a step, ``diverged`` (bool).
 
@@ -225,6 +255,8 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012 - as the base class has it
+    _counts_steps = True
+    """Whether it ends episodes by the steps of the task."""
 
     def __init__(
         self,
@@ -240,6 +272,8 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
             raise TandemError(f"TabletopEnv: render_mode = {render_mode!r}; choose rgb_array or None")
         super().__init__(1, 1, config, task, success_distance_m)
         self.np_random, self.render_mode = self._random[0], render_mode
+        step_s = self.config.physics_step_s * self.config.num_substeps
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / step_s)}
         self.observation_space = goal_space(self.config)
         self.action_space = action_space()
         self._image_size = (width, height)
@@ -280,7 +314,7 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
             raise ValueError(f"action: expected shape {(ACTION.size,)}, x, y, z and finger width, got {command.shape}")
         diverged = bool(self._advance(command[None])[0])
         observation, view = self._observe()
-        truncated = diverged or bool(self.rules.elapsed[0] >= self.rules.task.episode_steps)
+        truncated = diverged or (self._counts_steps and bool(self.rules.elapsed[0] >= self.rules.task.episode_steps))
         info = {"is_success": bool(self.rules.success(view)[0]), "diverged": diverged}
         return _first(observation), float(self.rules.reward(view)[0]), False, truncated, info
 
@@ -304,6 +338,12 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
             self._renderer.close()
             self._renderer = None
         self._worlds.close()
+
+
+class TimeLimitedEnv(TabletopEnv):
+    """A ``TabletopEnv`` whose episodes ``gymnasium.wrappers.TimeLimit`` ends, as ``gymnasium.make`` puts around it."""
+
+    _counts_steps = False
 
 
 def _first(observation: Observation) -> Observation:

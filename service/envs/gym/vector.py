@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from service.base.errors import TandemError
 from service.base.types import BoolArray, FloatArray
 from service.config import WorldConfig
 from service.envs.gym.tabletop import GoalWorlds, Observation, action_space, goal_space
@@ -35,12 +36,14 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         config: the world; the paper's by default.
         task: see ``TabletopEnv``.
         success_distance_m: greatest distance that counts as reached, metres.
-        max_episode_steps: where episodes are truncated; None: where the task says.
+        max_episode_steps: where episodes are truncated; None: where the task says; -1: nowhere.
         num_threads: native threads; 0 for one per core.
+        render_mode: None, as there are no pictures of many worlds.
 
     Raises:
-        TandemError: unknown ``task``, goals that the world cannot have, or a distance that is not positive.
-        ValueError: ``num_envs`` below 1.
+        TandemError: unknown ``task``, goals that the world cannot have, a distance that is not positive, or a
+            ``render_mode``.
+        ValueError: ``num_envs`` or ``max_episode_steps`` below 1.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - as the base class has it
@@ -54,12 +57,20 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         success_distance_m: float = 0.05,
         max_episode_steps: int | None = None,
         num_threads: int = 0,
+        render_mode: None = None,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs = {num_envs}; give at least 1")
+        if max_episode_steps is not None and max_episode_steps < 1 and max_episode_steps != -1:
+            raise ValueError(f"max_episode_steps = {max_episode_steps}; give at least 1, or -1 for no end")
+        if render_mode is not None:
+            raise TandemError(
+                f"TabletopVectorEnv: render_mode = {render_mode!r}; for pictures give gymnasium.make_vec "
+                'vectorization_mode="sync"'
+            )
         super().__init__(num_envs, num_threads, config, task, success_distance_m)
         self.num_envs = num_envs
-        self.max_episode_steps = max_episode_steps or self.rules.task.episode_steps
+        self.max_episode_steps = self.rules.task.episode_steps if max_episode_steps is None else max_episode_steps
         self.single_observation_space, self.single_action_space = goal_space(self.config), action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -103,7 +114,8 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         diverged = self._advance(actions)
         observation, view = self._observe()
         success, reward = self.rules.success(view), self.rules.reward(view)
-        truncated = diverged | (self.rules.elapsed >= self.max_episode_steps)
+        is_over = self.rules.elapsed >= self.max_episode_steps
+        truncated = diverged | (is_over & (self.max_episode_steps != -1))
         info: Info = _with_masks({"view": view.rows()}) if self.rules.task.is_own else {}
         if truncated.any():
             info |= _with_masks({"final_obs": _rows(observation, truncated)}, truncated)

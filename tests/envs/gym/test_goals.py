@@ -71,6 +71,7 @@ def test_many_worlds_have_one_goal_or_one_each(envs):
         ),
         ({"goal": (0.0, 0.0, -0.1)}, r"the nearest the arm comes is \(0.000, 0.000, 0.025\) m"),
         ({"goal": (0.0, 0.0, 3.0)}, "out of reach"),
+        ({"goal": "here"}, r"options\['goal'\] = 'here': give numbers, metres"),
         ({"gaol": GOAL}, "unknown option 'gaol'"),
     ],
 )
@@ -144,6 +145,41 @@ def test_goals_of_a_function_are_clear_of_what_stands_there():
             assert np.abs(np.array(goals)[:, 0] - config.workspace.center_x_m).min() >= 0.029
         env.close()
         assert np.ptp(goals, axis=0)[1] > 0.2
+
+
+BESIDE = {"obstacles": [{"shape": "box", "size_m": (0.08, 0.08, 0.06)}]}
+
+
+@pytest.mark.parametrize(("world", "out_of"), [({"fixture": "box"}, (0.0475, 0.0, 0.03)), (BESIDE, (0.0, 0.03, 0.03))])
+def test_a_goal_inside_what_stands_elsewhere_in_every_episode_is_refused(world, out_of):
+    """A side of the box is 4.5 to 5 cm from its middle; the obstacle reaches 4 cm from its own."""
+    env = TabletopEnv(WorldConfig(**world), task=Task("Table", goals="table"))
+    env.reset(seed=0)
+    places = env._worlds.places
+    inside = (places.box if places.box.size else places.obstacles[:, 0])[0] + out_of
+    beside = inside + np.array([0.0, 0.0, 0.15])
+    np.testing.assert_array_equal(env.reset(seed=0, options={"goal": beside})[0]["desired_goal"], np.float32(beside))
+    with pytest.raises(
+        TandemError, match=r"options\['goal'\] \(.*\) m: an object would be inside an obstacle, or a side"
+    ):
+        env.reset(seed=0, options={"goal": inside})
+    env.close()
+
+
+@pytest.mark.parametrize("name", ["starts", "goals"])
+def test_places_of_a_function_are_not_inside_a_side_of_the_box(name):
+    low, high = (-0.2, -0.15, 0.03), (0.1, 0.15, 0.03)
+    task = {"goals": "table", name: lambda s, rng: rng.uniform(low, high, s.objects.place.shape)}
+    envs = TabletopVectorEnv(60, CONFIG.model_copy(update={"fixture": "box"}), task=Task("Any", **task), num_threads=1)
+    envs.reset(seed=0)
+    place = {"starts": envs._worlds.object_position, "goals": envs._goal}[name]
+    furthest = np.abs(place - envs._worlds.box_place)[:, :2].max(axis=1)
+    # its sides are 4.5 to 5 cm from its middle, and the cube reaches 2.5 cm; a millimetre is allowed
+    assert not ((furthest > 0.02 + 0.001 + 1e-6) & (furthest < 0.075 - 0.001 - 1e-6)).any()
+    before = envs._worlds.object_position.copy()
+    envs.step(np.zeros((60, 4), dtype=np.float32))
+    assert np.abs(envs._worlds.object_position - before).max() < 0.006  # falls by 5 mm
+    envs.close()
 
 
 def test_the_documents_goals_are_where_it_says():

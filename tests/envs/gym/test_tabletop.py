@@ -71,6 +71,37 @@ def test_an_episode_is_as_long_as_its_task(task, num_steps):
     many.close()
 
 
+@pytest.mark.parametrize(
+    ("options", "expected"), [({}, 50), ({"max_episode_steps": 60}, 60), ({"max_episode_steps": -1}, None)]
+)
+def test_make_says_where_episodes_of_a_named_task_end(options, expected):
+    one, many = gymnasium.make("tandem/Push-v1", **options), gymnasium.make_vec("tandem/Push-v1", num_envs=2, **options)
+    one.reset(seed=0)
+    many.reset(seed=0)
+    still = np.zeros((2, 4), dtype=np.float32)
+    ends = [(one.step(still[0])[3], *many.step(still)[3].tolist()) for _ in range(expected or 61)]
+    assert ends == [(False,) * 3] * (len(ends) - 1) + [(expected is not None,) * 3]
+    one.close()
+    many.close()
+
+
+def test_nothing_is_stepped_before_an_episode_begins(env):
+    envs = TabletopVectorEnv(2, CONFIG, num_threads=1)
+    for each, still in ((env, np.zeros(4)), (envs, np.zeros((2, 4)))):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="call reset before step"):
+            each.step(still)
+        each.restore(each.state())
+        each.step(still)
+    envs.close()
+
+
+def test_films_have_the_pace_of_the_world(env):
+    assert env.metadata["render_fps"] == TabletopEnv.metadata["render_fps"] == 25
+    faster = TabletopEnv(WorldConfig(physics_step_s=0.005, num_substeps=4))
+    assert faster.metadata["render_fps"] == 50
+    faster.close()
+
+
 def test_reward_is_paid_at_every_step_on_target(env):
     observation, info = env.reset(seed=0)
     assert info == {"is_success": False}
@@ -179,6 +210,20 @@ def test_bad_actions_are_refused(env, action):
 def test_no_worlds_are_refused():
     with pytest.raises(ValueError, match="num_envs = 0; give at least 1"):
         TabletopVectorEnv(0, CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"max_episode_steps": 0}, "max_episode_steps = 0; give at least 1, or -1"),
+        ({"render_mode": "rgb_array"}, "render_mode = 'rgb_array'; .* vectorization_mode=\"sync\""),
+        ({"config": {"object": "sphere"}}, "config is a dict: give a WorldConfig"),
+    ],
+)
+def test_bad_options_of_many_are_named(options, said):
+    with pytest.raises(ValueError, match=said) as caught:
+        TabletopVectorEnv(2, **options)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(("option", "value"), [("render_mode", "human"), ("success_distance_m", 0.0)])
