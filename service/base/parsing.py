@@ -121,6 +121,12 @@ class _Loader(yaml.SafeLoader):
                 raise yaml.YAMLError(f"the key {key!r} is there {count} times")
         return node
 
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Copy what a mapping merges (``<<``) into it; merges of merges multiply before values can be counted."""
+        super().flatten_mapping(node)
+        if len(node.value) > MAX_YAML_VALUES:
+            raise yaml.YAMLError(f"more than {MAX_YAML_VALUES} values by merging")
+
     def fetch_flow_collection_start(self, TokenClass: Any) -> None:  # noqa: N803
         """Begin a list or mapping in brackets; PyYAML's time grows with the square of how deep they are."""
         if self.flow_level > MAX_DEPTH:

@@ -45,6 +45,7 @@ class Report:
         published: what the run published before.
         previous: the last status of an earlier process, whose totals go on. How far that came, and what a task has
             come to, stays until the run goes on: it may be refused.
+        identity: of the run, by which runs of the same id are told apart.
         epoch: number of this process among those that ever ran the run.
         options: of the command that goes on with it.
     """
@@ -58,6 +59,7 @@ class Report:
         *,
         published: str | None = None,
         previous: RunStatus | None = None,
+        identity: str = "",
         epoch: int = 0,
         options: Sequence[str] = (),
     ) -> None:
@@ -83,6 +85,7 @@ class Report:
             state="starting",
             started=now,
             heartbeat=now,
+            identity=identity,
             epoch=epoch,
             total_env_steps=config.run.total_env_steps,
             options=tuple(options),

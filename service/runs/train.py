@@ -151,7 +151,7 @@ def train(
         published, epoch = last.version if last is not None else None, directory.epoch
         report = Report(
             config, run_id, runtime.name, writer,
-            published=published, previous=previous, epoch=epoch, options=options,
+            published=published, previous=previous, identity=directory.history.run, epoch=epoch, options=options,
         )  # fmt: skip
         log = stack.enter_context(logging_to(directory.path))
         begins = "goes on with" if resume else "begins"

@@ -42,6 +42,8 @@ _HEADERS = {
     "cross-origin-opener-policy": "same-origin",
 }
 """Headers of every answer."""
+_LONG = ("/stream", "/v1/series.csv")
+"""Ends of paths whose answers are made piece by piece, for as long as the client is there."""
 _HOST = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([^:@/\[\]\s]+))(?::[0-9]{1,5})?")
 _logger = logging.getLogger(__name__)
 
@@ -59,7 +61,7 @@ class AuthMiddleware:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer the HTTP request, or pass it on if it is allowed; the server passes on nothing else."""
         inner = dict(scope)  # uvicorn and the router both write into theirs
-        if not scope["path"].endswith("/stream"):
+        if not scope["path"].endswith(_LONG):
             # or Starlette listens for the end of the client while it sends a file, and uvicorn reads on meanwhile
             inner["asgi"] = {**scope["asgi"], "spec_version": "2.4"}
             if scope["method"] == "HEAD":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -109,7 +110,7 @@ class RunDirectories:
         with suppress(OSError):  # most runs have no older recordings
             older = sorted((directory / RECORDINGS).iterdir(), reverse=True)
             paths |= {path.name: path for path in older[:MAX_RECORDINGS] if OLDER.fullmatch(path.name)}
-        return {name: path for name, path in paths.items() if path.is_file() and not path.is_symlink()}
+        return {name: path for name, path in paths.items() if os.path.isfile(path) and not os.path.islink(path)}
 
 
 def file_response(
@@ -133,11 +134,11 @@ def file_response(
     if _CONDITIONS.is_not_modified(response.headers, request.headers):
         return NotModifiedResponse(response.headers)
     begins = _begins(request.headers.get("range", ""), status.st_size)
-    beyond = max(begins, default=0) >= status.st_size
-    if begins and beyond and "if-range" not in request.headers:
+    beyond = [begin >= status.st_size for begin in begins]
+    if begins and all(beyond) and "if-range" not in request.headers:
         length = {"Content-Range": f"bytes */{status.st_size}"}
         raise ProblemError(416, "no-such-range", f"the file has {status.st_size} bytes", length)
-    if not begins or beyond:  # starlette would answer it with plain text
+    if not begins or any(beyond):  # starlette would answer it with plain text
         request.scope["headers"] = [each for each in request.scope["headers"] if each[0] != b"range"]
     return response
 

@@ -22,7 +22,8 @@ from service.registry.registry import Registry
 from service.store.models import ACTIVE, CONDITIONS, ActorStatus, Record, RunReader, RunState, RunStatus
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-NUM_ENDED_RUNS = 5
+NUM_ENDED_RUNS = 20
+FAILURES_S = 3600.0
 MAX_ACTIVE_RUNS = 50
 _STATES: tuple[RunState, ...] = get_args(RunState)
 _ACTOR_STATES: tuple[Literal["starting", "alive"], ...] = get_args(ActorStatus.model_fields["state"].annotation)
@@ -200,11 +201,18 @@ class Telemetry(Collector):
 
 
 def shown(runs: list[RunStatus]) -> list[RunStatus]:
-    """Select ``MAX_ACTIVE_RUNS`` active runs, as they are listed, and the last ``NUM_ENDED_RUNS`` that ended."""
+    """Select ``MAX_ACTIVE_RUNS`` active runs, as they are listed, and the last ``NUM_ENDED_RUNS`` that ended.
+
+    Those that failed or were interrupted within ``FAILURES_S`` come first: their alerts need them for minutes.
+    """
     active = [run for run in runs if run.state in ACTIVE]
     # Not by their start, by which they are listed: a long run that failed just now would be gone before its alert.
-    ended = sorted((run for run in runs if run.state not in ACTIVE), key=lambda run: run.heartbeat, reverse=True)
+    ended = sorted((run for run in runs if run.state not in ACTIVE), key=_urgency, reverse=True)
     return active[:MAX_ACTIVE_RUNS] + ended[:NUM_ENDED_RUNS]
+
+
+def _urgency(run: RunStatus) -> tuple[bool, datetime]:
+    return run.state in ("failed", "interrupted") and _age_s(run.heartbeat) < FAILURES_S, run.heartbeat
 
 
 def _families(runs: list[tuple[RunStatus, Record]]) -> Iterator[_Family]:

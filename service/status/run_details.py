@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from contextlib import suppress
 from pathlib import Path
@@ -42,7 +43,10 @@ def setup(run: RunStatus, directory: Path | None, registry: Path) -> RunSetup:
     try:
         config = read_yaml(file := directory / CONFIG_FILE)
     except ConfigError as error:
-        problem = str(error) if file.exists() else f"{file} is not there: the run has only begun, or it was removed"
+        # no exists() of Path: it raises where the directory may not be read
+        problem = (
+            str(error) if os.path.lexists(file) else f"{file} is not there: the run has only begun, or it was removed"
+        )
     path = directory.absolute()
     place = ["--registry", str(registry.absolute())]
     begun, options = (path.parent, _study_options(path.parent)) if is_study(path.parent) else (path, run.options)

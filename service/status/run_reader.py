@@ -6,6 +6,8 @@
 | metrics, goals | the run's directory; Redis if there is no directory on this machine |
 | a request to stop | sent to both |
 
+Where Redis has another run with the same id, the directory's is shown, and Redis is not asked to stop the other.
+
 If Redis is unavailable, everything in the directories can still be read, and each active run has a warning.
 """
 
@@ -96,8 +98,10 @@ class CombinedReader(RunReader):
 
     @override
     def request_stop(self, run_id: str) -> None:
-        self.run(run_id)  # or raise UnknownRunError
-        self._ask_redis(lambda: self._redis.request_stop(run_id))
+        shown = self.run(run_id)  # or raise UnknownRunError
+        in_redis = self._ask_redis(lambda: self._redis.run(run_id))
+        if in_redis is not None and not _are_two(shown, in_redis):
+            self._ask_redis(lambda: self._redis.request_stop(run_id))
         with suppress(UnknownRunError):  # of a run on another machine
             self._disk.request_stop(run_id)
 
@@ -109,6 +113,12 @@ class CombinedReader(RunReader):
     def _merge(self, on_disk: RunStatus | None, in_redis: RunStatus | None) -> RunStatus:
         if on_disk is None or in_redis is None:
             (newer,) = (run for run in (on_disk, in_redis) if run is not None)
+        elif _are_two(on_disk, in_redis):
+            newer = on_disk.suffering(
+                "well",
+                f"another run with the id {on_disk.run_id}, which began on {in_redis.started:%d %B %Y}, reports to "
+                "Redis and is not shown: give one of the two another directory",
+            )
         else:
             # Where no report comes, the directory's lock tells whether its process lives.
             in_front = in_redis.heartbeat > on_disk.heartbeat - _ABOUT_EQUAL and in_redis.condition != "silent"
@@ -146,3 +156,8 @@ class CombinedReader(RunReader):
             _logger.warning("Redis is back")
         self._failure = None
         return answer
+
+
+def _are_two(one: RunStatus, other: RunStatus) -> bool:
+    """Whether two reports under one id are of two runs; those of earlier versions do not tell."""
+    return bool(one.identity and other.identity) and one.identity != other.identity

@@ -102,7 +102,8 @@ def _read(status: RunStatus, trial: Trial, path: Path) -> _Run:
         if not is_last or not {"success_last", "num_episodes"} <= result["evaluation"].keys():
             result = None
     ended = (path / RESULT_FILE).stat().st_mtime if result is not None else 0.0
-    made = {} if result is None else result.get("made", {})
+    made = {} if result is None else result.get("made")
+    made = made if isinstance(made, dict) else {}
     version = settings.get("task_version")
     column = (trial.task, version if isinstance(version, int) else 0)
     counted = {  # of a text of a user's its digest tells another

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import math
 import os
 import re
 import shutil
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -41,6 +44,10 @@ QUIET_S = 10.0
 """A run writes its status every second; after so long something keeps it from that."""
 MAX_COLUMN_BYTES = 512 * 1024 * 1024
 """Of metrics in memory: all 70 of 90 runs with 10,000 iterations each."""
+_ALWAYS_NEW_S = 0.5
+"""Short lists, made within a tenth of this, are made for everybody who asks."""
+_PASSING = (errno.ESTALE, errno.EIO, errno.EAGAIN, errno.EINTR, errno.ETIMEDOUT)
+"""Failures of a disk, mostly one of the network, after which it may answer again; the run is what it was."""
 FULL_BYTES = 1_000_000
 """A disk with less room than this is full: a status and a grid would not fit."""
 
@@ -58,7 +65,7 @@ def run_id_of(directory: Path) -> str:
     path = Path(os.path.realpath(directory))  # ``Path.resolve`` does not survive a loop of links
     name = f"{path.parent.name[: 127 - len(path.name[:100])]}-{path.name}" if is_study(path.parent) else path.name
     known = re.sub(r"[^A-Za-z0-9._-]", "-", name).lstrip("._-")[:128]
-    if known == name.replace(" ", "-"):
+    if known == name:
         return known
     return f"{known[:119] or 'run'}-{sha256(name.encode(errors='surrogateescape')).hexdigest()[:8]}"  # no other's id
 
@@ -95,15 +102,27 @@ class DiskReader(RunReader):
         self._records: dict[Path, RecordFile] = {}
         self._found: dict[str, Path] = {}
         """Directories of the last listing, by the ids of their runs."""
+        self._statuses: list[RunStatus] = []
+        self._good_until_s = -math.inf
+        self._listing = Lock()
         self._in_columns: list[RecordFile] = []
         """Those with columns in memory, the one that was asked for last at the end."""
+        self._last: dict[Path, RunStatus] = {}
+        """As they were read last."""
         self._pulse = Pulse()
         self._lock = Lock()
 
     @override
     def runs(self) -> list[RunStatus]:
-        statuses = [self._status(run_id, path) for run_id, path in self._list().items()]
-        return sorted(statuses, key=lambda status: status.started, reverse=True)
+        """A list that took long is good for ten times as long: however many ask, about a tenth of a core makes it."""
+        with self._listing:
+            begun_s = time.monotonic()
+            if begun_s >= self._good_until_s:
+                statuses = [self._status(run_id, path) for run_id, path in self._list().items()]
+                self._statuses = sorted(statuses, key=lambda status: status.started, reverse=True)
+                now_s = time.monotonic()
+                self._good_until_s = now_s + 10.0 * (now_s - begun_s) - _ALWAYS_NEW_S
+            return [*self._statuses]
 
     @override
     def run(self, run_id: str) -> RunStatus:
@@ -162,9 +181,13 @@ class DiskReader(RunReader):
         try:
             status = self._read_status(run_id, path)
         except Exception as error:  # whatever a directory holds, it must not hide the other runs
+            last = self._last.get(path)
+            if isinstance(error, OSError) and error.errno in _PASSING and last is not None:
+                return last.suffering("well", f"{STATUS_FILE} cannot be read right now: {error.strerror}")
             return _damaged(run_id, path, f"{path} cannot be read: {one_line(str(error), 300)}")
         if (number := self._records_of(path).num_passed_over) > 0:
             status = status.suffering("well", f"metrics.jsonl: lines that are no records and are passed over: {number}")
+        self._last[path] = status
         return status
 
     def _read_status(self, run_id: str, path: Path) -> RunStatus:

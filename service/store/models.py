@@ -135,6 +135,7 @@ class RunStatus(FrozenModel):
     state: RunState
     started: AwareDatetime = Field(description="UTC, of the process that runs it now or ran it last")
     heartbeat: AwareDatetime = Field(description="UTC, when its runner last wrote this")
+    identity: str = Field("", description="the same after every resume; another run with this id has another one")
     epoch: int = Field(0, ge=0, description="number of that process among those that ever ran it")
     iteration: int = Field(0, ge=0)
     num_env_steps: int = Field(0, ge=0)

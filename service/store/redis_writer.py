@@ -170,9 +170,9 @@ class RedisWriter:
         Raises:
             RunTakenError: another run, or a newer process of this one, reports under this run id.
         """
+        del self._waiting[: -keys.MAX_RECORDS]  # Redis would keep no more of them
         if not self._is_known:
             self._introduce()
-        del self._waiting[: -keys.MAX_RECORDS]  # Redis would keep no more of them
         newest, records = dict(self._newest), self._waiting[:BATCH]
         with self._client.pipeline() as pipe:
             pipe.watch(self._key("epoch"))

@@ -99,7 +99,7 @@ class RecordFile:
     def after(self, iteration: int) -> list[Record]:
         """The records of iterations above ``iteration``, in order."""
         with self._open() as file:
-            kept = _read_from(file, max(0, file.seek(0, 2) - _TAIL_BYTES))
+            kept = _newest(file)
             if not kept or _iteration(kept[0]) > iteration:
                 kept = _read_from(file, 0)
         return [record for record in kept if _iteration(record) > iteration]
@@ -107,7 +107,7 @@ class RecordFile:
     def newest(self) -> Record | None:
         """The last record."""
         with self._open() as file:
-            kept = _read_from(file, max(0, file.seek(0, 2) - _TAIL_BYTES))
+            kept = _newest(file)
         return kept[-1] if kept else None
 
     def sample(self, name: str, number: int) -> list[float | None]:
@@ -121,7 +121,7 @@ class RecordFile:
                     file.readline(_MAX_LINE_BYTES)  # the rest of a line
                 if (record := parse_record(file.readline(_MAX_LINE_BYTES))) is not None:
                     found[_iteration(record)] = record
-            for last in _read_from(file, max(0, size - _TAIL_BYTES))[-1:]:
+            for last in _newest(file)[-1:]:
                 found[_iteration(last)] = last
         return [record.get(name) for record in found.values()]
 
@@ -178,6 +178,14 @@ def _lines(file: BinaryIO) -> Iterator[bytes]:
     """Whole lines from here on. One that is too long is no record, nor is what follows it."""
     while (line := file.readline(_MAX_LINE_BYTES)).endswith(b"\n"):
         yield line
+
+
+def _newest(file: BinaryIO) -> list[Record]:
+    """The newest records, the last three at least, if there are as many."""
+    end, size = file.seek(0, 2), _TAIL_BYTES
+    while len(kept := _read_from(file, max(0, end - size))) < 3 and size < end:
+        size *= 4
+    return kept
 
 
 def _read_from(file: BinaryIO, start: int) -> list[Record]:

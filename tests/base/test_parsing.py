@@ -68,6 +68,11 @@ LAUGHS = "a: &a [x, x, x]\n" + "".join(
 )
 
 
+MERGED = "a0: &a0 {x: 1}\n" + "".join(
+    f"a{level}: &a{level} {{<<: [{', '.join([f'*a{level - 1}'] * 9)}]}}\n" for level in range(1, 10)
+)
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
@@ -77,6 +82,7 @@ LAUGHS = "a: &a [x, x, x]\n" + "".join(
         ("- " * 100_000, "nested more than 64 deep"),
         ("[" * (MAX_DEPTH + 1) + "]" * (MAX_DEPTH + 1), "nested more than 64 deep"),
         (LAUGHS, "more than 5000 values"),
+        (MERGED, "not YAML (more than 5000 values by merging)"),
         ("a: &a {b: {c: *a}}", "nested more than 64 deep"),
         ("!!python/object/apply:os.system [id]", "not YAML (could not determine a constructor"),
         ("!!bool x", "not YAML ('x')"),

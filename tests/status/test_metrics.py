@@ -156,17 +156,26 @@ def test_the_number_of_series_is_bounded():
     assert ids[:2] == ["run-1", "run-3"]
     ended = [f"run-{n}" for n in range(0, 2 * NUM_ENDED_RUNS, 2)]
     assert ids[metrics.MAX_ACTIVE_RUNS :] == ended  # however many are active: or none that fails would be told of
-    ids = [run.run_id for run in metrics.shown(runs[:20])]
-    assert ids == [f"run-{n}" for n in range(1, 20, 2)] + ended
+    ids = [run.run_id for run in metrics.shown(runs[:60])]
+    assert ids == [f"run-{n}" for n in range(1, 60, 2)] + ended
 
 
 def test_a_long_run_that_failed_just_now_is_shown():
     when, hour = datetime(2026, 1, 1, tzinfo=UTC), timedelta(hours=1)
-    ended = [when - number * hour for number in range(9)]
+    ended = [when - number * hour for number in range(2 * NUM_ENDED_RUNS)]
     short = [status(f"wall-{n}", state="finished", started=at, heartbeat=at) for n, at in enumerate(ended)]
-    failed = status("cube", state="failed", started=when - 10 * hour, heartbeat=when)
+    failed = status("cube", state="failed", started=when - 100 * hour, heartbeat=when)
     ids = [run.run_id for run in metrics.shown([*short, failed])]
-    assert ids == ["wall-0", "cube", "wall-1", "wall-2", "wall-3"]
+    assert ids == ["wall-0", "cube", *(f"wall-{n}" for n in range(1, NUM_ENDED_RUNS - 1))]
+
+
+def test_a_run_that_was_interrupted_minutes_ago_is_shown_however_many_have_ended_since():
+    now, minute = datetime.now(UTC), timedelta(minutes=1)
+    later = [status(f"wall-{n}", state="finished", heartbeat=now) for n in range(NUM_ENDED_RUNS)]
+    killed = [status(f"killed-{n}", state="interrupted", heartbeat=now - n * minute) for n in (5, 70)]
+    ids = [run.run_id for run in metrics.shown([*later, *killed])]
+    assert (ids[0], len(ids)) == ("killed-5", NUM_ENDED_RUNS)
+    assert "killed-70" not in ids
 
 
 def test_everything_served_is_in_the_reference(service):

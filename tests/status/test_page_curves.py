@@ -210,12 +210,15 @@ def test_the_newest_value_is_that_of_the_whole_run(visit):
             const panel = { title: '', hint: '', curves: [['bob/success_rate', '']] }
             const board = new Board([{ id: 'cube' }], [panel], new AbortController().signal)
             await board.refresh()
+            const whole = await board.newest(['bob/success_rate'])
             board.range = [0, 1000]
             await board.refresh()
-            return [board.data, board.unzoomed].map(data => data.get('cube').curves['bob/success_rate'].mean.at(-1))
+            const zoomed = await board.newest(['no/such', 'bob/success_rate'])
+            const shown = board.data.get('cube').curves['bob/success_rate'].mean
+            return [whole.get('cube'), shown.at(-1), zoomed.get('cube')]
         }"""
     )
-    assert newest == [0.25, 0.375]
+    assert newest == [0.375, 0.25, 0.375]
 
 
 def test_a_missing_value_is_a_gap_and_a_new_one_is_drawn(visit, home):

@@ -56,6 +56,20 @@ def test_a_directory_that_was_written_later(reader, root):
     assert reader.run("cube").iteration == 9
 
 
+def test_another_run_with_the_same_id_in_redis_is_not_shown_or_stopped(reader, redis, root):
+    client, key = redis.address.client(1.0), run_key("cube", "status")
+    sound = client.get(key)
+    client.set(key, status("cube", iteration=7, identity="theirs").model_dump_json())
+    write_status(root, "cube", identity="ours", iteration=3, heartbeat=datetime.now(UTC) - timedelta(seconds=5))
+    for shown in (reader.run("cube"), next(run for run in reader.runs() if run.run_id == "cube")):
+        assert (shown.identity, shown.iteration) == ("ours", 3)
+        assert "another run with the id cube" in shown.warnings[0]
+    reader.request_stop("cube")
+    assert (root / "cube" / "stop").exists()
+    assert not RedisReader(redis.address).run("cube").stopping
+    client.set(key, sound)
+
+
 def test_a_damaged_status_in_redis_does_not_hide_a_sound_directory(reader, redis):
     client, keys = redis.address.client(1.0), [run_key(run_id, "status") for run_id in ("cube", "far")]
     sound = client.mget(keys)

@@ -1,5 +1,6 @@
 """Status files: how often they are written, a full disk, an older tandem's runs, a file cut under its reader."""
 
+import errno
 import json
 import os
 import re
@@ -14,7 +15,7 @@ import pytest
 from service.base.errors import StoreError
 from service.base.jsonl import JsonlWriter
 from service.base.lock import DirectoryLock
-from service.store import disk_reader
+from service.store import disk_reader, tail
 from service.store.disk_reader import DiskReader, run_id_of
 from service.store.models import Pulse
 from service.store.run_directory import RunDirectory
@@ -147,7 +148,7 @@ def test_a_copied_directory_is_another_run_and_what_is_no_run_is_none(ended):
 
 
 def test_the_runs_of_a_study_are_listed_with_the_others_under_its_name(tmp_path):
-    study = tmp_path / "night 1"
+    study = tmp_path / "night-1"
     for path in (tmp_path / "cube", study / "seed-0", study / "seed-12"):
         path.mkdir(parents=True)
         RunWriter(RunDirectory(path)).status(a_status(run_id_of(path), state="finished", iteration=len(path.name)))
@@ -155,19 +156,63 @@ def test_the_runs_of_a_study_are_listed_with_the_others_under_its_name(tmp_path)
     (study / "study.json").touch()
     (study / "seed-99").mkdir()  # not begun
     runs = {run.run_id: (run.iteration, run.study) for run in DiskReader(tmp_path).runs()}
-    assert runs == {"cube": (4, None), "night-1-seed-0": (6, "night 1"), "night-1-seed-12": (7, "night 1")}
+    assert runs == {"cube": (4, None), "night-1-seed-0": (6, "night-1"), "night-1-seed-12": (7, "night-1")}
     assert {run.run_id for run in DiskReader(study).runs()} == {"night-1-seed-0", "night-1-seed-12"}
     assert DiskReader(tmp_path).run("night-1-seed-12").run_id == "night-1-seed-12"
 
 
+@pytest.mark.parametrize(("error", "shown"), [(errno.ESTALE, "running"), (errno.EACCES, "interrupted")])
+def test_a_status_that_cannot_be_read_for_a_moment(told, monkeypatch, error, shown):
+    reader = told(a_status(num_env_steps=700))
+    before = reader.run("cube")
+
+    def fail(*_):
+        raise OSError(error, os.strerror(error))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(disk_reader, "read_regular", fail)
+        found = reader.run("cube")
+    assert found.state == shown
+    if shown == "running":
+        assert (found.num_env_steps, len(found.warnings)) == (700, 1)
+        assert "status.json cannot be read right now" in found.warnings[0]
+    assert reader.run("cube") == before
+
+
+def test_a_list_that_takes_long_is_made_once_for_many(told, monkeypatch):
+    reader = told(a_status(iteration=1))
+    now_s, made = [0.0], []
+
+    def slow(*_, status=reader._status):
+        made.append(now_s[0])
+        now_s[0] += 0.3
+        return status(*_)
+
+    monkeypatch.setattr(disk_reader.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(reader, "_status", slow)
+    for asked_s in (0.0, 0.4, 2.7, 2.9):
+        now_s[0] = max(asked_s, now_s[0])
+        assert [run.iteration for run in reader.runs()] == [1]
+    assert made == [0.0, 2.9]
+
+
+@pytest.mark.parametrize("size", [100, 17_000, 44_000])
+def test_the_newest_records_however_long_they_are(tmp_path, monkeypatch, size):
+    path, read = tmp_path / "metrics.jsonl", []
+    with path.open("w") as file:
+        for number in range(1, 41):
+            file.write(json.dumps(a_record(number, **{"x" * size: 1.0})) + "\n")
+    monkeypatch.setattr(tail, "parse_record", lambda line, parse=tail.parse_record: read.append(line) or parse(line))
+    assert [each["iteration"] for each in RecordFile(path).after(39)] == [40]
+    assert RecordFile(path).newest()["iteration"] == 40
+    assert size == 100 or len(read) <= 30  # and not all forty, twice
+
+
 def test_run_ids_of_directories(tmp_path):
-    for name, run_id in (("cube-1", "cube-1"), ("my run", "my-run")):
-        assert run_id_of(tmp_path / name) == run_id
-        assert a_status(run_id).run_id == run_id
-    strange = {
-        name: run_id_of(tmp_path / name) for name in ("..odd_", ".odd_", "\u00e9", "\u65e5\u672c", "\u4e2d\u56fd")
-    }
-    assert [run_id.rpartition("-")[0] for run_id in strange.values()] == ["odd_", "odd_", "run", "run", "run"]
+    assert run_id_of(tmp_path / "cube-1") == a_status("cube-1").run_id == "cube-1"
+    names = ("..odd_", ".odd_", "my run", "\u00e9", "\u65e5\u672c", "\u4e2d\u56fd")
+    strange = {name: run_id_of(tmp_path / name) for name in names}
+    assert [run_id.rpartition("-")[0] for run_id in strange.values()] == ["odd_", "odd_", "my-run", *["run"] * 3]
     assert len({a_status(run_id).run_id for run_id in strange.values()}) == len(strange)  # none has another's
     study = tmp_path / ("x" * 200)
     study.mkdir()

@@ -136,6 +136,7 @@ def test_a_resumed_run_makes_its_last_iterations_again(store):
     tell(store, records=[a_record(number, past=0) for number in range(1, 8)])
     writer = store.writer("cube")
     assert len(store.reader.metrics("cube")) == 7
+    assert store.reader.columns("cube", ["past"]).metrics["past"].tolist() == [0] * 7
     writer.metrics(a_record(5, past=1))
     wait_until(lambda: len(store.reader.metrics("cube")) == 5)
     writer.metrics(a_record(6, past=1))
@@ -143,6 +144,7 @@ def test_a_resumed_run_makes_its_last_iterations_again(store):
     writer.close()
     records = store.reader.metrics("cube")
     assert [(each["iteration"], each["past"]) for each in records] == [(1, 0), (2, 0), (3, 0), (4, 0), (5, 1), (6, 2)]
+    assert store.reader.columns("cube", ["past"]).metrics["past"].tolist() == [0, 0, 0, 0, 1, 2]
 
 
 def test_the_newest_start_comes_first_and_an_unknown_run_is_told_which_there_are(store):

@@ -182,6 +182,37 @@ def test_no_more_records_wait_than_redis_keeps(redis, writer, reader, monkeypatc
     wait_until(lambda: iterations(reader) == list(range(6, 16)))
 
 
+def test_no_more_records_wait_of_a_run_that_was_resumed_while_redis_is_away(redis, reader, monkeypatch):
+    monkeypatch.setattr(address, "MAX_RECORDS", 10)
+    redis.kill()
+    writer = a_writer(redis.address, resumed=True)
+    for number in range(1, 16):
+        writer.metrics(a_record(number))
+    wait_until(lambda: any("; 10 records wait for it" in trouble.text for trouble in writer.troubles()))
+    redis.revive()
+    writer.status(a_status())
+    wait_until(lambda: iterations(reader) == list(range(6, 16)) if reader.runs() else [])
+    writer.close()
+
+
+def test_new_columns_need_new_records_alone(redis, writer, reader, monkeypatch):
+    asked, lines_of = [], RedisReader._lines
+    monkeypatch.setattr(RedisReader, "_lines", lambda *each: asked.append(lines_of(*each)) or asked[-1])
+    writer.status(a_status())
+    for number in range(1, 6):
+        writer.metrics(a_record(number))
+    wait_until(lambda: reader.runs() and iterations(reader) == list(range(1, 6)))
+    asked.clear()
+    for _ in range(2):
+        assert reader.columns("cube", []).iteration.tolist() == [1, 2, 3, 4, 5]
+    writer.metrics(a_record(6))
+    wait_until(lambda: reader.columns("cube", []).iteration.tolist() == [1, 2, 3, 4, 5, 6])
+    assert [len(lines) for lines in asked[:2]] == [5, 1]
+    assert {len(lines) for lines in asked[2:]} <= {1, 2}
+    writer.metrics(a_record(3, new=1))  # the run went back
+    wait_until(lambda: reader.columns("cube", []).iteration.tolist() == [1, 2, 3])
+
+
 def test_closing_sends_what_waits_and_history_in_redis_is_bounded(redis, reader, monkeypatch):
     monkeypatch.setattr(address, "MAX_RECORDS", 20)
     monkeypatch.setattr(redis_writer, "BATCH", 7)

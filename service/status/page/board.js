@@ -21,7 +21,7 @@ let boards = 0;
 export class Board {
   /** ``runs`` are {id, label, study}; ``panels`` those that are always there; ``banded``: whether seeds may be a band. */
   constructor(runs, panels, signal) {
-    Object.assign(this, { runs, signal, data: new Map(), unzoomed: new Map(), names: [], cursor: null, range: null });
+    Object.assign(this, { runs, signal, data: new Map(), names: [], cursor: null, range: null });
     Object.assign(this, { axis: "env_steps", place: null, log: false, banded: false, pending: false, asked: 0 });
     this.number = ++boards;
     this.panels = panels.map((spec) => new Panel(spec, this));
@@ -88,18 +88,9 @@ export class Board {
   async refresh() {
     const asked = ++this.asked;
     const names = [...new Set(this.shown().flatMap((panel) => panel.names))];
-    const parts = split("names", names, MAX_NAMES);
-    const chunks = split("runs", this.runs.map((run) => run.id), MAX_RUNS);
-    const answers = await Promise.all(parts.flatMap((part) => chunks.map((runs) => this.ask(part, runs))));
+    const data = await this.find(names, this.range);
     if (asked !== this.asked) return; // something else was asked for meanwhile
-    this.data = new Map();
-    for (const { runs } of answers) {
-      for (const run of runs) {
-        const known = this.data.get(run.run_id);
-        this.data.set(run.run_id, known ? { ...run, curves: { ...known.curves, ...run.curves } } : run);
-      }
-    }
-    if (!this.range) this.unzoomed = this.data; // which has the newest values
+    this.data = data;
     this.learn();
     const stamp = JSON.stringify([this.axis, this.range, names, [...this.data.values()].map((run) => [run.run_id, run.last_iteration, run.x.length, run.problem])]);
     if (stamp === this.stamp) return; // ended runs are asked for again and again
@@ -107,12 +98,26 @@ export class Board {
     await this.draw();
   }
 
-  /** Ask for some curves; names and runs are pairs of a query. */
-  ask(names, runs) {
-    const [start, end] = this.range ?? [null, null];
+  /** Ask for the curves of some metrics in a part of the axis, null for all of it: by the runs' ids. */
+  async find(names, range) {
     const unit = this.axis === "wall_s" ? HOUR_S : 1;
-    const bounds = this.range ? [["start", start * unit], ["end", end * unit]] : [];
-    return get(["v1", "series"], [...runs, ...names, ["axis", this.axis], ["max_points", MAX_POINTS], ...bounds], this.signal);
+    const bounds = range ? [["start", range[0] * unit], ["end", range[1] * unit]] : [];
+    const ask = (part, runs) => get(["v1", "series"], [...runs, ...part, ["axis", this.axis], ["max_points", MAX_POINTS], ...bounds], this.signal);
+    const chunks = split("runs", this.runs.map((run) => run.id), MAX_RUNS);
+    const answers = await Promise.all(split("names", names, MAX_NAMES).flatMap((part) => chunks.map((runs) => ask(part, runs))));
+    const found = new Map();
+    for (const run of answers.flatMap(({ runs }) => runs)) {
+      const known = found.get(run.run_id);
+      found.set(run.run_id, known ? { ...run, curves: { ...known.curves, ...run.curves } } : run);
+    }
+    return found;
+  }
+
+  /** The newest value of the first of some metrics that a run has, also while a part is shown: by the runs' ids. */
+  async newest(names) {
+    const data = this.range ? await this.find(names, null) : this.data;
+    const last = (curve) => curve?.mean.findLast((value) => value !== null);
+    return new Map([...data].map(([id, { curves }]) => [id, names.map((name) => last(curves[name])).find(Number.isFinite)]));
   }
 
   /** Take over what the answers say beside curves: names of metrics, and runs that cannot be read. */

@@ -26,12 +26,19 @@ export async function compareView(root, ids, signal) {
   const [curves, setups] = [section("Curves", "wide"), section("What differs", "wide")];
   curves.body.append(board.root);
   root.replaceChildren(el("h1", {}, `${counted(ids.length, "run")} compared`), el("div", { class: "scroll" }, table.root), curves.root, setups.root);
-  const show = (found) => table.update(runs.map((run) => ({ ...run, run, status: found.get(run.id), success: found.get(run.id)?.trial?.success ?? newest(board, run.id) })));
-  show(statuses);
+  const row = (run, status, success) => ({ ...run, run, status, success: status?.trial?.success ?? success });
+  const show = (found, newest) => table.update(runs.map((run) => row(run, found.get(run.id), newest.get(run.id))));
+  let newest = new Map();
+  show(statuses, newest);
   compareConfigurations(setups.body, ids, signal);
   await every(EVERY_MS, signal, async () => {
-    await board.refresh().catch((error) => board.fail(error));
-    show(await statusesOf(ids, signal));
+    try {
+      await board.refresh();
+      newest = await board.newest(SUCCESS);
+    } catch (error) {
+      board.fail(error);
+    }
+    show(await statusesOf(ids, signal), newest);
   });
 }
 
@@ -74,11 +81,6 @@ async function statusOf(id, signal) {
     if ([404, 422].includes(error.status)) return null;
     throw error;
   }
-}
-
-function newest(board, id) {
-  const curves = board.unzoomed.get(id)?.curves ?? {};
-  return SUCCESS.map((name) => curves[name]?.mean.findLast((value) => value !== null)).find(Number.isFinite);
 }
 
 async function compareConfigurations(body, ids, signal) {

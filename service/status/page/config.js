@@ -22,6 +22,9 @@ export class ConfigList {
   }
 
   update({ config, problem }) {
+    const key = JSON.stringify([config, problem]);
+    if (key === this.key) return; // so that what somebody has selected stays so
+    this.key = key;
     this.rows = flat(config);
     this.problem = problem;
     this.show();

@@ -19,6 +19,8 @@ const GOALS_MS = 5000;
 const FILES_MS = 15_000;
 const CURVES_MS = 2000;
 const BOB = "bob/success_rate";
+/** Names that the registry takes; a damaged directory has its id in place of one. */
+const NAME = /^[a-z0-9][a-z0-9._-]{0,63}$/;
 const ORDER = ["starting", "alive"];
 
 /** Show a run until ``signal`` aborts. */
@@ -51,7 +53,7 @@ class RunPage {
       media: section("Recordings"), actors: section("Actors"), log: section("Log"), commands: section("Commands"), config: section("Configuration"),
     };
     for (const name of run.trial ? ["space", "map", "actors"] : []) delete parts[name]; // which self-play has
-    const [name, published] = run.trial ? (run.trial.primitives ?? "").split("@") : [run.name, true];
+    const [name, published] = run.trial ? (run.trial.primitives ?? "").split("@") : [run.name, NAME.test(run.name)];
     this.primitives = published ? new Versions(name, `Primitives ${name}`) : null;
     parts.curves.body.append(this.board.root);
     this.actorsBody = parts.actors?.body;
@@ -102,8 +104,7 @@ class RunPage {
         await this.board.refresh();
         this.missed = false;
         this.summary.trouble(null);
-        const curve = this.board.unzoomed.get(this.runId)?.curves[BOB];
-        this.summary.success(curve?.mean.findLast((value) => value !== null));
+        this.summary.success((await this.board.newest([BOB])).get(this.runId));
         await new Promise((resolve) => setTimeout(resolve, CURVES_MS));
       } while (this.again && !this.signal.aborted);
     } catch (error) {
