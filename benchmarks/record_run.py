@@ -30,6 +30,7 @@ from service.actors.evaluation import DeterministicPolicy, IdlePolicy, evaluate
 from service.base.errors import TandemError
 from service.base.tensors import split_parts
 from service.base.types import StateArray
+from service.base.version import LEARNING_VERSION
 from service.config import Config, WorldConfig
 from service.config.run import CELL_SIZE_M
 from service.config.skills import SkillDiscoveryConfig
@@ -80,7 +81,7 @@ _Player = Callable[..., StateArray]
 
 def head_of(config: Config, name: str) -> Run:
     """What every file of a run begins with; ``name`` is for tables."""
-    recorded = machine()
+    recorded = machine() | {"learning_version": LEARNING_VERSION}
     return {
         "format_version": FORMAT_VERSION, "name": name, "recorded": recorded, "config": config.model_dump(mode="json")
     }  # fmt: skip

@@ -60,6 +60,8 @@ class Experiment:
     """What to run, in this order."""
     needs: Path | None = None
     """It can be run if this is there."""
+    hours: float = 0.3
+    """Of one core beside another one that is busy, as those that are recorded took."""
 
 
 def experiments(out: Path = RESULTS) -> Iterator[Experiment]:
@@ -103,14 +105,15 @@ def _longer(out: Path, task: str, method: str, updates: int | None = None) -> Ex
     extra += [] if updates is None else ["--set", f"sac.gradient_steps={updates}"]
     directory = "downstream_longer" if updates is None else f"downstream_longer_{updates}"
     found = _table(out, directory, task, method, 0, PRIMITIVES[0], tuple(extra))
+    hours = 1.3 if updates is None else 2.6
     group = "a million env steps" + ("" if updates is None else f", {updates} updates")
-    return replace(found, group=group, part=f"{task}-{method}")
+    return replace(found, group=group, part=f"{task}-{method}", hours=hours)
 
 
 def _two_cubes(out: Path, task: str, method: str, seed: int, reference: str) -> Experiment:
     extra = ("--set", f"run.total_env_steps={TWO_CUBES_ENV_STEPS}")
     found = _table(out, "two_cubes", task, method, seed, reference, extra)
-    return replace(found, group="tasks of two cubes", part=f"{_name(task)}-{method}")
+    return replace(found, group="tasks of two cubes", part=f"{_name(task)}-{method}", hours=0.5)
 
 
 def _name(task: str) -> str:
@@ -130,7 +133,8 @@ def _table(
         *("--set", "run.num_threads=1", *extra),
     )
     versions = out / "primitives" / "models" / reference.partition("@")[0]
-    return Experiment(name, file, TASK_METHODS[method].title, task, seed, (command,), versions)
+    found = Experiment(name, file, TASK_METHODS[method].title, task, seed, (command,), versions)
+    return found if TASK_METHODS[method].learns else replace(found, hours=0.02)
 
 
 def _skills(out: Path, seed: int) -> Iterator[Experiment]:
@@ -157,7 +161,7 @@ def _discover(out: Path, method: str, seed: int) -> Experiment:
         *("--set", f"seed={seed}", "--set", f"run.total_env_steps={SKILL_ENV_STEPS}", "--set", "run.num_threads=1"),
     )
     record = _python("benchmarks.record_run", str(run), "--skills", "--out", str(file))
-    return Experiment(f"skills/{method}-{seed}", file, "skill discovery", method, seed, (train, record))
+    return Experiment(f"skills/{method}-{seed}", file, "skill discovery", method, seed, (train, record), hours=1.6)
 
 
 def _python(*arguments: str) -> Command:
@@ -206,7 +210,9 @@ def main() -> int:
     given = parser.parse_args()
     everything = list(experiments())
     missing = [each for each in everything if not each.file.exists()]
-    print(f"{len(everything) - len(missing)} of {len(everything)} are there, {len(missing)} to run")
+    hours = sum(each.hours for each in missing)
+    there = len(everything) - len(missing)
+    print(f"{there} of {len(everything)} are there, {len(missing)} to run, some {hours:.0f} hours of one core")
     if given.list:
         for experiment in missing:
             print(experiment.name)

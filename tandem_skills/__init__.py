@@ -70,7 +70,7 @@ _PLACES = {
     "__version__": "service",
 }
 """Modules of the names, which are imported when they are asked for."""
-__all__ = list(_PLACES)
+__all__ = [name for name in _PLACES if not name.startswith("_")]
 
 
 if not TYPE_CHECKING:  # for which a name that is not above would be anything

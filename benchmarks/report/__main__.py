@@ -18,7 +18,7 @@ from typing import Any
 from benchmarks import scaling, time_to_skill, transfer
 from benchmarks.measuring import one_line_errors
 from benchmarks.report import comparison, figures, measured, pretraining, recipe, skills
-from benchmarks.report.downstream import draw_table, each_seed, methods_table, write_results
+from benchmarks.report.downstream import check_versions, draw_table, each_seed, methods_table, write_results
 from benchmarks.report.results import Result, by_method_and_task, read_all
 from benchmarks.reproduce import MANY_UPDATES, RESULTS, TWO_CUBES, experiments
 from benchmarks.run_files import Run
@@ -109,7 +109,9 @@ class Report:
         runs = [run for run in read_all(self._results / "runs").values() if "ablation" not in run]
         todays = self._results / RESULTS.name
         trials = list(read_all(todays / "downstream").values())
-        two_cubes = by_method_and_task(list(read_all(todays / "two_cubes").values()))
+        on_two_cubes = list(read_all(todays / "two_cubes").values())
+        check_versions(on_two_cubes)
+        two_cubes = by_method_and_task(on_two_cubes)
         # of version 1 until those of today's are whole
         recorded_skills = list(read_all(self._results / "skills").values())
         for page, names in PAGES.items():  # what is wrong with a page is found before anything is drawn
@@ -203,6 +205,7 @@ class Report:
             list(read_all(self._results / RESULTS.name / f"downstream_{name}").values())
             for name in ("paper", "longer", f"longer_{MANY_UPDATES}")
         )
+        check_versions([*trials, *as_paper, *longer, *more_updates])
         blocks = {
             "rows": [comparison.comparison_table(trials, as_paper)],
             "longer": [],

@@ -88,18 +88,25 @@ def harder_table(results: Sequence[Result]) -> str:
 
 
 def missing_table(planned: Sequence[Experiment]) -> str:
-    """How many of the planned experiments have their file, and which lack it, in the order of their plan."""
+    """How many of the planned experiments have their file, and which lack it, with hours, in the plan's order."""
     groups = defaultdict[str, list[Experiment]](list)
     for experiment in planned:
         groups[experiment.group].append(experiment)
     done = {title: sum(each.file.exists() for each in group) for title, group in groups.items()}
     rows = [
-        (title, f"{done[title]} of {len(group)}", _missing(group))
+        (title, f"{done[title]} of {len(group)}", _missing(group), f"{_hours(group):.1f}")
         for title, group in groups.items()
         if done[title] < len(group)
     ]
     words = f"{sum(done.values())} of {len(planned)} experiments are recorded."
-    return f"{words} Missing:\n\n{table(('', 'recorded', 'missing'), rows)}" if rows else words
+    left = f"The others take some {_hours(planned):.0f} hours of one core."
+    heads = ("", "recorded", "missing", "hours of one core")
+    return f"{words} {left} Missing:\n\n{table(heads, rows)}" if rows else words
+
+
+def _hours(group: Sequence[Experiment]) -> float:
+    """Of one core, of those that lack their file."""
+    return sum(each.hours for each in group if not each.file.exists())
 
 
 def _missing(group: Sequence[Experiment]) -> str:

@@ -63,6 +63,6 @@ def main() -> None:
     """Entry point of ``tandem`` and ``python -m service``."""
     stop_with_parent()
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[_Log()])
-    for name in ("OpenGL", "torch"):  # they say at INFO what they do without, and what their caches held
+    for name in ("OpenGL", "httpx", "torch"):  # they say at INFO what they do without, ask for, or have in caches
         logging.getLogger(name).setLevel(logging.WARNING)
     app()

@@ -31,6 +31,10 @@ def find_class(method: str, code: Mapping[str, str]) -> type[Config]:
     """
     if user_code.parse_reference(method) is not None:
         found: type[Config] = user_code.find_class(method, code, Config)
+        if found.build is Config.build and not found.made_in:
+            raise ConfigError(
+                f"{method}: {found.__name__} has no build(self, registry, start_from), which makes the Method"
+            )
         return found
     if method not in METHODS:
         raise ConfigError(

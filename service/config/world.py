@@ -216,7 +216,8 @@ class WorldConfig(FrozenModel):
             raise ValueError(f"object = {self.object!r} and objects: a world has the one or the other")
         if self.num_objects > 1 and self.fixture != "none":
             raise ValueError(
-                f"fixture = {self.fixture!r} and {self.num_objects} objects: it is for one; describe it in fixtures"
+                f"fixture = {self.fixture!r} and {self.num_objects} objects: it is for one; take one, or describe it "
+                "in fixtures of a world of your own"
             )
         if self.observed.obstacles and not self.obstacles:
             raise ValueError("observed.obstacles, and no obstacles: describe some, or leave it out")

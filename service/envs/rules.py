@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.base.errors import ConfigError, in_metres
+from service.base.errors import ConfigError, TandemError, in_metres
 from service.base.types import Array, BoolArray, StateArray
 from service.base.user_code import CodeError, checked, naming_errors_of, place_of, shown
 from service.config.run import SUCCESS_DISTANCE_M
@@ -48,7 +48,10 @@ class Rules:
         if self.task.closed:
             raise CodeError(self.task.closed)
         if isinstance(self.task.goals, str):
-            check_goals(self.task.goals, worlds.config)
+            try:
+                check_goals(self.task.goals, worlds.config)
+            except TandemError as error:
+                raise (CodeError(f"{self.task.name}: {error}") if self.task.code else error) from None
         if self.task.starts is not None and worlds.config.num_objects > 1 and "object_size" in worlds.bank.drawn:
             raise ConfigError(
                 f"{self.task.title}: its starts know objects of one size, and world.randomisation.object_size draws "

@@ -16,7 +16,7 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
 from service.base.types import Array, BoolArray, FloatArray, StateArray
-from service.base.user_code import CodeError
+from service.base.user_code import CodeError, find, parse_reference
 from service.envs.observations import each_object
 
 if TYPE_CHECKING:
@@ -166,7 +166,7 @@ class Task:
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         if not self.code:
             return partial(Task, **values), ()
-        found = _found_again(self.name, self.code, {})
+        found = task_in(self.name, self.code)
         changes = {name: value for name, value in values.items() if value is not getattr(found, name)}
         return _found_again, (self.name, self.code, changes)
 
@@ -210,10 +210,20 @@ class Task:
         return {**kept, "world": to_jsonable_python(dict(self.world), fallback=float), "goals": self.goal_kind}
 
 
-def _found_again(name: str, code: Mapping[str, str], changes: Mapping[str, Any]) -> Task:
-    from service.envs.tasks import find_task
+def task_in(name: str, texts: Mapping[str, str]) -> Task:
+    """Find the task that ``FILE.py`` or ``FILE.py:NAME`` names, in texts of files by their names.
 
-    return replace(find_task(name, code), **changes)
+    Raises:
+        CodeError: the text does not run, or has no such task.
+    """
+    reference = parse_reference(name)
+    assert reference is not None, "a name of ours"
+    task: Task = find(reference, texts, lambda each: isinstance(each, Task), "task")
+    return replace(task, name=name, code={reference.origin: texts[reference.origin]})
+
+
+def _found_again(name: str, texts: Mapping[str, str], changes: Mapping[str, Any]) -> Task:
+    return replace(task_in(name, texts), **changes)
 
 
 class _NotGiven(NDArrayOperatorsMixin):

@@ -121,7 +121,7 @@ def check_source(config: SelfPlayConfig) -> None:
     if not len(goal):
         raise ConfigError(
             f"generator.goal_source = {config.generator.goal_source!r}: it gives no goal in the workspace "
-            "while nothing is known"
+            "while nothing is known: let it give some without known.near, such as known.random(rng)"
         )
 
 

@@ -36,7 +36,7 @@ def take_over(
         What was taken, in words.
     """
     if before.num_objects != after.num_objects:
-        return f"not taken, it was trained with {before.num_objects} objects, here is {after.num_objects}"
+        return f"not taken, it was trained in a world of {_objects(before)}, and this run has {_objects(after)}"
     if before.alike != after.alike:
         return f"not taken, objects {_numbers(before)} were alike where it was trained, here {_numbers(after)} are"
     for seen in inputs:
@@ -65,6 +65,10 @@ def take_over(
     new, gone = sorted(sees - saw), sorted(saw - sees)
     notes = [f"{word} {', '.join(names)}" for word, names in (("new", new), ("left out", gone)) if names]
     return f"taken{': ' if notes else ''}{'; '.join(notes)}"
+
+
+def _objects(seen: Layouts) -> str:
+    return f"{seen.num_objects} object{'s' * (seen.num_objects > 1)}"
 
 
 def _numbers(seen: Layouts) -> str:

@@ -167,7 +167,10 @@ class Distillation(Method):
         """Begin with the teacher's parameters, as far as they fit."""
         world = self._config.world
         if (there := start.world.num_objects) != (here := world.num_objects):
-            raise TandemError(f"--from {start.reference}: it was trained with {there} objects, here are {here}")
+            raise TandemError(
+                f"--from {start.reference}: it was trained in a world of {there} object{'s' * (there > 1)}, and this "
+                f"run has {here}: name what was trained in such a world"
+            )
         if start.world.num_observed_obstacles not in (0, num := len(world.obstacles)):
             raise TandemError(
                 f"--from {start.reference}: it sees {start.world.num_observed_obstacles} obstacles, here are {num}: "

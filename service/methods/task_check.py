@@ -32,7 +32,7 @@ def check_fits(method: TaskMethod, trained: Trained) -> None:
     if method.takes == "skills" and trained.kind != "skills":
         name = method.skills or "lsd"
         raise TandemError(
-            f"the method {method.title} needs skills, and {trained.label} has none: name some by --primitives, such "
+            f"the method {method.title} needs skills, and {trained.label} has none: name some, such "
             f"as panda-cube-{name}@latest, which tandem train --method {name} makes"
         )
     if method.takes is not None:

@@ -239,7 +239,7 @@ class Trained:
         if (num := world.num_objects) != known.num_objects:
             of = f"a world of {known.num_objects} object{'s' * (known.num_objects > 1)}"
             raise TandemError(
-                f"{self.label} was trained in {of}, and {task.title} has {num}: name what fits there, by --primitives"
+                f"{self.label} was trained in {of}, and {task.title} has {num}: name what was trained in such a world"
             )
         if (there := layouts(world).positions.size) != (seen := layouts(known).positions.size):
             raise TandemError(

@@ -6,6 +6,7 @@ the method alone, which also says whether an iteration has ended.
 
 from __future__ import annotations
 
+import json
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -20,10 +21,11 @@ from service.base.types import Arrays, Metrics
 from service.base.user_code import CodeError, naming_errors_of, origin_of
 from service.config import Config
 from service.methods.method import Iteration, Method, State
-from service.policies.parameters import PolicyError
+from service.policies.parameters import Parameters, PolicyError
 from service.runs.resuming import changed_settings
 from service.store.checkpoints import CheckpointStore
 from service.store.run_directory import Published, Resumption, RunDirectory
+from service.store.tail import INDEX
 
 Ending = Literal["finished", "converged"]
 OnIteration = Callable[[Metrics], Ending | None]
@@ -89,6 +91,7 @@ class Run:
         """Of a method of a user's, its file."""
         with self.naming_errors():
             method = make()
+        self._expect(isinstance(method, Method), "build", method, "a Method")
         self.method = method
         method.on_wait = self._beat
         try:
@@ -171,7 +174,7 @@ class Run:
                 self._check(ended, before)
             if ended is not None and interval and self.iteration % interval == 0:
                 with method.timing("evaluate"), self.naming_errors():
-                    evaluated = method.evaluate()
+                    evaluated = self.numbers("evaluate", method.evaluate())
         except (DivergedError, PolicyError) as error:
             raise self._diverged(error, played) from error
         except CodeError as error:
@@ -210,13 +213,41 @@ class Run:
 
     def _check(self, ended: object, before: int) -> None:
         """Check an iteration of a user's method, which began at so many env steps."""
-        if not isinstance(ended, Iteration):
-            raise CodeError(f"{self._origin}: step gave a {type(ended).__name__}; give an Iteration or None")
+        self._expect(isinstance(ended, Iteration), "step", ended, "an Iteration or None")
+        assert isinstance(ended, Iteration)
+        metrics = self.numbers("the Iteration of step", ended.metrics)
+        if any(metrics.get(name) is None for name in INDEX):
+            raise CodeError(
+                f"{self._origin}: the metrics of an Iteration lack iteration and env_steps: begin them with what "
+                "self.count(NUMBER) gives"
+            )
         self._num_idle = self._num_idle + 1 if self.num_env_steps <= before else 0
         if self._num_idle >= MAX_IDLE:
             raise CodeError(
                 f"{self._origin}: {MAX_IDLE} iterations made no env steps; say how many with self.count(NUMBER)"
             )
+
+    def numbers(self, verb: str, found: Metrics) -> Metrics:
+        """Metrics that a verb of the method gave; those of a user's are checked."""
+        self._expect(isinstance(found, Mapping), verb, found, "metrics, numbers by name")
+        for name, value in found.items() if self._origin is not None else ():
+            is_number = value is None or (isinstance(value, int | float | np.number) and not np.iscomplexobj(value))
+            if not (isinstance(name, str) and is_number):
+                raise CodeError(f"{self._origin}: {verb} gave {name!r}: {value!r}; give numbers by name")
+        return found
+
+    def parameters(self) -> Parameters:
+        """What the method has learned."""
+        with self.naming_errors():
+            found = self.method.parameters()
+        fits = isinstance(found, Mapping) and all(isinstance(array, np.ndarray) for array in found.values())
+        self._expect(fits, "parameters", found, "NumPy's arrays by name")
+        return found
+
+    def _expect(self, fits: bool, verb: str, found: object, wanted: str) -> None:
+        """Refuse what a verb of a user's method gave."""
+        if self._origin is not None and not fits:
+            raise CodeError(f"{self._origin}: {verb} gave a {type(found).__name__}; give {wanted}")
 
     def _record(self, ended: Iteration, metrics: Metrics) -> None:
         for name, diverged in ended.diverged.items():
@@ -262,7 +293,17 @@ class Run:
         directory = self.directory
         with self.method.timing("checkpoint"):
             with self.naming_errors():
-                arrays, values = flatten(self.method.state())
+                state = self.method.state()
+            self._expect(isinstance(state, Mapping), "state", state, "arrays and plain values by name")
+            arrays, values = flatten(state)
+            for name, value in values.items() if self._origin is not None else ():
+                try:
+                    json.dumps(value)
+                except (TypeError, ValueError) as error:
+                    raise CodeError(
+                        f"{self._origin}: state gave {name!r}: {error}; give arrays by name, or plain values, as JSON "
+                        "has them"
+                    ) from None
             directory.check_owner()
             directory.sync()
             meta = {
@@ -285,7 +326,7 @@ class Run:
         tenths = [steps * NUM_SNAPSHOTS // self.config.run.total_env_steps for steps in (before, self.num_env_steps)]
         if tenths[0] != tenths[1]:
             with self.method.timing("checkpoint"):
-                arrays = {f"{self.config.part}/{name}": array for name, array in self.method.parameters().items()}
+                arrays = {f"{self.config.part}/{name}": array for name, array in self.parameters().items()}
                 self._snapshots.save(self.iteration, arrays, {"env_steps": self.num_env_steps})
 
     @contextmanager

@@ -263,7 +263,7 @@ def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, repor
     _logger.info("learning is over; now evaluating, publishing, drawing and recording a video")
     config, directory = run.config, run.directory
     with run.naming_errors():
-        parameters, measured = run.method.parameters(), dict(run.method.measure())
+        parameters, measured = run.parameters(), dict(run.numbers("measure", run.method.measure()))
     # a method of a user's may give numbers of NumPy's, and such as are none
     metrics = {name: value for name, value in plain(measured).items() if value is not None}
     if missing := measured.keys() - metrics.keys():

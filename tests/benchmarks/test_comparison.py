@@ -44,18 +44,18 @@ def test_what_is_missing_by_hand(tmp_path):
         file = tmp_path / f"{part}-{seed}.json"
         if done:
             file.touch()
-        return Experiment(file.stem, file, group, part, seed, [])
+        return Experiment(file.stem, file, group, part, seed, [], hours=0.4)
 
     some = [planned("ours", "box", 0, done=True), planned("controls", "uniform", 0, done=False)]
     some += [planned("ours", part, seed, done=False) for seed in (1, 2) for part in ("box", "wall", "push")]
     some += [planned("ours", "wall", 0, done=False), planned("ours", "push", 0, done=True)]
     some += [planned("idle", "inair", 0, done=True), planned("controls", "uniform", 2, done=False)]
     assert missing_table(some).splitlines() == [
-        "3 of 12 experiments are recorded. Missing:",
+        "3 of 12 experiments are recorded. The others take some 4 hours of one core. Missing:",
         "",
-        "|  | recorded | missing |",
-        "| --- | --- | --- |",
-        "| ours | 2 of 9 | box, push: seeds 1, 2; wall: seeds 1, 2, 0 |",
-        "| controls | 0 of 2 | all: seeds 0, 2 |",
+        "|  | recorded | missing | hours of one core |",
+        "| --- | --- | --- | --- |",
+        "| ours | 2 of 9 | box, push: seeds 1, 2; wall: seeds 1, 2, 0 | 2.8 |",
+        "| controls | 0 of 2 | all: seeds 0, 2 | 0.8 |",
     ]
     assert missing_table(some[:1]) == "1 of 1 experiments are recorded."

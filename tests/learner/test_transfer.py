@@ -77,7 +77,7 @@ def test_policies_of_two_objects():
     same = rows_of(wider.bob, {entry: rows[:, part] for entry, part in two.bob.columns.items()})
     torch.testing.assert_close(outputs(new, same), outputs(trained, rows))  # the nearest is first in both
     said = take_over(networks.make_bob(SMALL, PAPER), parameters, two, PAPER, BOB_INPUTS)
-    assert said == "not taken, it was trained with 2 objects, here is 1"
+    assert said == "not taken, it was trained in a world of 2 objects, and this run has 1 object"
     other = Layouts(num_objects=2)
     said = take_over(networks.make_bob(SMALL, other), parameters, two, other, BOB_INPUTS)
     assert said == "not taken, objects 1, 2 were alike where it was trained, here none are"

@@ -126,7 +126,28 @@ def test_a_key_of_one_method_is_unknown_to_another(file, method, key, said):
         ("count(10)", "count(0)", "mine.py: 20 iterations made no env steps; say how many with self.count(NUMBER)"),
         ('"evaluation/height": self.height', '"evaluation/height": 1 / 0', "mine.py:18: ZeroDivisionError: "),
         ('"rng": self.rng.bit', '"rng": self.rgn.bit', "mine.py:24: AttributeError: "),
-        ('return {"evaluation/height": self.height}', "pass", "TypeError: 'NoneType' object is not iterable"),
+        (
+            'return {"evaluation/height": self.height}',
+            "pass",
+            "mine.py: measure gave a NoneType; give metrics, numbers",
+        ),
+        ("return Climb(self)", "return 3", "mine.py: build gave a int; give a Method"),
+        ("self.count(10) | {", "{", "the metrics of an Iteration lack iteration and env_steps"),
+        (
+            '"climb/height": self.height',
+            '"climb/height": "high"',
+            "mine.py: the Iteration of step gave 'climb/height': 'high'",
+        ),
+        (
+            'return {"height": np.array([self.height])}',
+            "return 3",
+            "mine.py: parameters gave a int; give NumPy's arrays",
+        ),
+        (
+            '"rng": self.rng.bit_generator.state',
+            '"rng": object()',
+            "mine.py: state gave 'rng': Object of type object is not",
+        ),
     ],
 )
 def test_an_error_of_the_method_names_its_line(file, tmp_path, monkeypatch, old, new, said):
@@ -153,6 +174,7 @@ def test_what_it_measures_that_is_no_number_is_told(file, tmp_path, caplog):
             "mine.py:Climb: no class that derives from Config of that name",
         ),
         ("mine.py:Yours", "mine.py:Yours: no class that derives from Config of that name"),
+        ("unbuilt.py", "unbuilt.py: Mine has no build(self, registry, start_from), which makes the Method"),
         ("gone.py:Mine", "gone.py: no such file"),
         ("bad.py:Mine", "bad.py:1: ZeroDivisionError: division by zero"),
         ("notes.txt:Mine", "notes.txt: no module of that name"),
@@ -161,6 +183,7 @@ def test_what_it_measures_that_is_no_number_is_told(file, tmp_path, caplog):
 )
 def test_what_is_no_method(file, tmp_path, method, said):
     (tmp_path / "bad.py").write_text("1 / 0")
+    (tmp_path / "unbuilt.py").write_text(CODE.replace("def build", "def bulid"))
     (tmp_path / "notes.txt").write_text("class Mine: ...")
     with pytest.raises(ConfigError) as error:
         parse_config({"method": method}, where="a test")

@@ -13,8 +13,8 @@ from importlib import import_module
 from typing import Any
 
 from service.base.errors import TandemError, did_you_mean
-from service.base.user_code import find, parse_reference, recorded
-from service.envs.task import Task
+from service.base.user_code import parse_reference, recorded
+from service.envs.task import Task, task_in
 
 PAPERS = ("larger", "inair", "push", "sphere", "wall", "box")
 _HARD = "hard-"
@@ -39,14 +39,11 @@ def find_task(name: str, code: Mapping[str, str] | None = None, world: Mapping[s
     """
     if name in TASKS:
         return _our_task(name)
-    reference = parse_reference(name)
-    if reference is None:
+    if parse_reference(name) is None:
         raise TandemError(
             f"unknown task {name!r}; choose one of {', '.join(TASKS)}, or write FILE.py:NAME{did_you_mean(name, TASKS)}"
         )
-    texts = recorded(name, code or {})
-    task: Task = find(reference, texts, lambda each: isinstance(each, Task), "task")
-    task = replace(task, name=name, code={reference.origin: texts[reference.origin]})
+    task = task_in(name, recorded(name, code or {}))
     return task if world is None else replace(task, world=world)
 
 
