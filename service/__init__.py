@@ -116,7 +116,7 @@ def train(
 
 def evaluate(
     trained: Trained,
-    task: str | Task | None = None,
+    task: Path | str | Task | None = None,
     *,
     goals: GoalKind | None = None,
     num_episodes: int = 300,
@@ -143,7 +143,8 @@ def evaluate(
 
     if num_episodes < 1:
         raise ValueError(f"num_episodes = {num_episodes}; give at least 1")
-    on = trained.on(task) if task is None or isinstance(task, str) else trained.playing(task)
+    name = str(task) if isinstance(task, Path) else task
+    on = trained.on(name) if name is None or isinstance(name, str) else trained.playing(name)
     first_seed = seed if on.task is None else seed + FINAL_SEED
     return evaluation.evaluate(
         on.player(), on.world, on.on_goals(goals), num_episodes=num_episodes,

@@ -121,10 +121,13 @@ class _Loader(yaml.SafeLoader):
                 raise yaml.YAMLError(f"the key {key!r} is there {count} times")
         return node
 
+    num_merged = 0
+
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        """Copy what a mapping merges (``<<``) into it; merges of merges multiply before values can be counted."""
+        """Copy what a mapping merges (``<<``) into it: once for each use, so merges of merges multiply."""
         super().flatten_mapping(node)
-        if len(node.value) > MAX_YAML_VALUES:
+        self.num_merged += len(node.value)
+        if self.num_merged > 2 * MAX_YAML_VALUES:  # each mapping is counted, and again where it is merged
             raise yaml.YAMLError(f"more than {MAX_YAML_VALUES} values by merging")
 
     def fetch_flow_collection_start(self, TokenClass: Any) -> None:  # noqa: N803

@@ -63,6 +63,6 @@ def main() -> None:
     """Entry point of ``tandem`` and ``python -m service``."""
     stop_with_parent()
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[_Log()])
-    for name in ("OpenGL", "httpx", "torch"):  # they say at INFO what they do without, ask for, or have in caches
+    for name in ("OpenGL", "httpx", "torch"):  # at INFO they say much that nobody asked for
         logging.getLogger(name).setLevel(logging.WARNING)
     app()

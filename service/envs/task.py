@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -165,9 +164,11 @@ class Task:
         """Pickle a task of a user's file as its text and what was changed: others find no module with its functions."""
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         if not self.code:
-            return partial(Task, **values), ()
+            return Task, tuple(values.values())
         found = task_in(self.name, self.code)
-        changes = {name: value for name, value in values.items() if value is not getattr(found, name)}
+        changes = {
+            name: value for name, value in values.items() if name != "code" and value is not getattr(found, name)
+        }
         return _found_again, (self.name, self.code, changes)
 
     @property
@@ -217,7 +218,8 @@ def task_in(name: str, texts: Mapping[str, str]) -> Task:
         CodeError: the text does not run, or has no such task.
     """
     reference = parse_reference(name)
-    assert reference is not None, "a name of ours"
+    if reference is None or reference.origin not in texts:
+        raise CodeError(f"task {name!r}: it is in {', '.join(texts)}; leave its name FILE.py or FILE.py:NAME")
     task: Task = find(reference, texts, lambda each: isinstance(each, Task), "task")
     return replace(task, name=name, code={reference.origin: texts[reference.origin]})
 

@@ -184,7 +184,10 @@ class ComposePrimitives(
         return self.env.get_wrapper_attr("state")()
 
     def restore(self, state: Any) -> Any:
-        """Go back to a saved state, and return the observation there: the next composition acts on it."""
+        """Go back to a saved state, and return the observation there: the next composition acts on it.
+
+        Nothing in between may change observations.
+        """
         return self._observe(self.env.get_wrapper_attr("restore")(state))
 
 

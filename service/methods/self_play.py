@@ -206,9 +206,10 @@ class LocalSelfPlay(SelfPlay):
     def _take_over(self, start: Trained) -> None:
         lines = self.learner.take_over(start.networks, layouts(start.world))
         if not any(": taken" in line for line in lines):  # or a run from nothing would have it as its parent
-            sizes = " of shape " in lines[0] or " parameters " in lines[0]
-            mend = "give this run the sizes of that one's networks (policy)" if sizes else "name what fits this world"
-            raise TandemError(f"--from {start.reference}: nothing of it fits: {lines[0]}; {mend}, or leave out --from")
+            raise TandemError(
+                f"--from {start.reference}: nothing of it fits: {lines[0]}; take one of such a world and networks of "
+                "these sizes (policy), or leave out --from"
+            )
         for line in lines:
             _logger.info("from %s: %s", start.reference, line)
 

@@ -126,14 +126,18 @@ class NumpyMCPPolicy(NumpyPolicy):
         """Mean and std, (..., A) each, of the primitives at (..., P) positions under given (..., K) weights.
 
         Raises:
-            PolicyError: the last axis is not P, or not K; a weight below 0, or all of a row 0.
+            PolicyError: the last axis is not P, or not K; a weight below 0, all of a row 0, or weights beyond float32.
         """
         weights = np.asarray(weights, dtype=np.float32)
         if weights.shape[-1:] != (self.num_primitives,):
             raise PolicyError(f"weights: expected shape (..., {self.num_primitives}), got {weights.shape}")
-        if not (weights.min(initial=0.0) >= 0.0 and (weights.max(axis=-1) > 0.0).all()):
-            raise PolicyError("weights: give numbers of at least 0, and in each row one above 0")
-        return self._compose(positions, weights)
+        with np.errstate(all="ignore"):
+            mean, std = self._compose(positions, weights)
+        if not (weights.min(initial=0.0) >= 0.0 and np.isfinite(mean).all() and np.isfinite(std).all()):
+            raise PolicyError(
+                "weights: give numbers of at least 0, in each row one above 0, and none too large or small"
+            )
+        return mean, std
 
     def distribution(self, observation: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and std, (..., A) each, of the composition at (..., O) observations.

@@ -6,7 +6,6 @@ the method alone, which also says whether an iteration has ended.
 
 from __future__ import annotations
 
-import json
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -16,6 +15,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from service.base.errors import CheckpointError, ConfigError, DivergedError, TandemError
+from service.base.jsonl import plain
 from service.base.tensors import split_parts
 from service.base.types import Arrays, Metrics
 from service.base.user_code import CodeError, naming_errors_of, origin_of
@@ -231,17 +231,19 @@ class Run:
         """Metrics that a verb of the method gave; those of a user's are checked."""
         self._expect(isinstance(found, Mapping), verb, found, "metrics, numbers by name")
         for name, value in found.items() if self._origin is not None else ():
-            is_number = value is None or (isinstance(value, int | float | np.number) and not np.iscomplexobj(value))
-            if not (isinstance(name, str) and is_number):
-                raise CodeError(f"{self._origin}: {verb} gave {name!r}: {value!r}; give numbers by name")
+            if not (isinstance(name, str) and isinstance(plain(value), int | float | None)):
+                raise CodeError(
+                    f"{self._origin}: {verb} gave {name!r}: {value!r}, which is no number; give numbers by name"
+                )
         return found
 
     def parameters(self) -> Parameters:
         """What the method has learned."""
         with self.naming_errors():
             found = self.method.parameters()
-        fits = isinstance(found, Mapping) and all(isinstance(array, np.ndarray) for array in found.values())
-        self._expect(fits, "parameters", found, "NumPy's arrays by name")
+        self._expect(isinstance(found, Mapping), "parameters", found, "NumPy's arrays by name")
+        for name, array in found.items():
+            self._expect(isinstance(array, np.ndarray), f"parameters, {name!r},", array, "one of NumPy's arrays")
         return found
 
     def _expect(self, fits: bool, verb: str, found: object, wanted: str) -> None:
@@ -296,14 +298,6 @@ class Run:
                 state = self.method.state()
             self._expect(isinstance(state, Mapping), "state", state, "arrays and plain values by name")
             arrays, values = flatten(state)
-            for name, value in values.items() if self._origin is not None else ():
-                try:
-                    json.dumps(value)
-                except (TypeError, ValueError) as error:
-                    raise CodeError(
-                        f"{self._origin}: state gave {name!r}: {error}; give arrays by name, or plain values, as JSON "
-                        "has them"
-                    ) from None
             directory.check_owner()
             directory.sync()
             meta = {
@@ -313,9 +307,24 @@ class Run:
                 "run": directory.history.run,
                 "state": values,
             }
-            with directory.noting(directory.checkpoints):
+            with directory.noting(directory.checkpoints), self._saving("state"):
                 self.checkpoints.save(self.iteration, arrays, meta)
         self._saved = self.iteration
+
+    @contextmanager
+    def _saving(self, verb: str) -> Iterator[None]:
+        """Name the verb of a user's method that gave what cannot be saved."""
+        try:
+            yield
+        except TandemError:
+            raise
+        except (TypeError, ValueError) as error:
+            if self._origin is None:
+                raise
+            raise CodeError(
+                f"{self._origin}: {verb} gave what cannot be saved: {error}; give arrays of numbers, and of a state "
+                "also plain values, as JSON has them"
+            ) from error
 
     def _take_snapshot(self, *, before: int) -> None:
         """Keep what was learned for good, if a tenth of the budget is over since so many env steps.
@@ -327,7 +336,8 @@ class Run:
         if tenths[0] != tenths[1]:
             with self.method.timing("checkpoint"):
                 arrays = {f"{self.config.part}/{name}": array for name, array in self.parameters().items()}
-                self._snapshots.save(self.iteration, arrays, {"env_steps": self.num_env_steps})
+                with self._saving("parameters"):
+                    self._snapshots.save(self.iteration, arrays, {"env_steps": self.num_env_steps})
 
     @contextmanager
     def _tolerating(self, consequence: str) -> Iterator[None]:

@@ -64,8 +64,8 @@ class AuthMiddleware:
         if not scope["path"].endswith(_LONG):
             # or Starlette listens for the end of the client while it sends a file, and uvicorn reads on meanwhile
             inner["asgi"] = {**scope["asgi"], "spec_version": "2.4"}
-            if scope["method"] == "HEAD":
-                inner["method"] = "GET"  # uvicorn leaves the body out
+        if scope["method"] == "HEAD" and not scope["path"].endswith("/stream"):
+            inner["method"] = "GET"  # uvicorn leaves the body out
         begun_s, status = time.perf_counter(), 0
 
         async def answer(message: Message) -> None:

@@ -6,7 +6,8 @@
 | metrics, goals | the run's directory; Redis if there is no directory on this machine |
 | a request to stop | sent to both |
 
-Where Redis has another run with the same id, the directory's is shown, and Redis is not asked to stop the other.
+Where Redis has another run with the same id, one of the two is shown, the directory's unless only the other one is
+active, and only this one is asked to stop.
 
 If Redis is unavailable, everything in the directories can still be read, and each active run has a warning.
 """
@@ -114,11 +115,14 @@ class CombinedReader(RunReader):
         if on_disk is None or in_redis is None:
             (newer,) = (run for run in (on_disk, in_redis) if run is not None)
         elif _are_two(on_disk, in_redis):
-            newer = on_disk.suffering(
-                "well",
-                f"another run with the id {on_disk.run_id}, which began on {in_redis.started:%d %B %Y}, reports to "
-                "Redis and is not shown: give one of the two another directory",
-            )
+            newer = on_disk
+            if in_redis.state in ACTIVE:
+                both = f"two runs have the id {on_disk.run_id}, one in a directory here and one that reports to Redis: "
+                if on_disk.state in ACTIVE:
+                    text = "the second is not shown; give one of them another directory"
+                else:
+                    newer, text = in_redis, "curves and files shown here are those of the first; rename its directory"
+                newer = newer.suffering("well", both + text)
         else:
             # Where no report comes, the directory's lock tells whether its process lives.
             in_front = in_redis.heartbeat > on_disk.heartbeat - _ABOUT_EQUAL and in_redis.condition != "silent"

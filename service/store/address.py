@@ -31,7 +31,7 @@ VARIABLE = "TANDEM_REDIS_URL"
 RUNS = "tandem:runs"
 Content = Literal["status", "metrics", "goals", "stop", "heartbeat", "epoch"]
 MAX_RECORDS = 20_000
-"""Of one run, about 60 MB; ``metrics.jsonl`` has them all."""
+"""Of one run, about 70 MB; ``metrics.jsonl`` has them all."""
 HEARTBEAT_S = 10.0
 EXPIRING: Sequence[Content] = ("status", "metrics", "goals", "epoch")
 KEPT_S = 30 * 86_400

@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from hashlib import sha256
@@ -45,7 +45,8 @@ QUIET_S = 10.0
 MAX_COLUMN_BYTES = 512 * 1024 * 1024
 """Of metrics in memory: all 70 of 90 runs with 10,000 iterations each."""
 _ALWAYS_NEW_S = 0.5
-"""Short lists, made within a tenth of this, are made for everybody who asks."""
+"""A list that took less than a tenth of this is never kept."""
+MAX_KEPT_S = 5.0
 _PASSING = (errno.ESTALE, errno.EIO, errno.EAGAIN, errno.EINTR, errno.ETIMEDOUT)
 """Failures of a disk, mostly one of the network, after which it may answer again; the run is what it was."""
 FULL_BYTES = 1_000_000
@@ -58,7 +59,7 @@ def is_study(path: Path) -> bool:
 
 
 def run_id_of(directory: Path) -> str:
-    """A run's id on one machine: the name of its directory, with a dash for what an id may not hold.
+    """A run's id on one machine: the name of its directory; with a dash for what an id may not hold, and a digest then.
 
     That of a study's run begins with the name of the study.
     """
@@ -95,10 +96,15 @@ def run_directories(root: Path) -> dict[str, Path]:
 
 
 class DiskReader(RunReader):
-    """The runs of a directory of run directories; for any number of threads at once."""
+    """The runs of a directory of run directories; for any number of threads at once.
 
-    def __init__(self, root: Path) -> None:
-        self.root = root
+    Args:
+        root: has the run directories.
+        clock: counts seconds, and never jumps.
+    """
+
+    def __init__(self, root: Path, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self.root, self._clock = root, clock
         self._records: dict[Path, RecordFile] = {}
         self._found: dict[str, Path] = {}
         """Directories of the last listing, by the ids of their runs."""
@@ -107,21 +113,21 @@ class DiskReader(RunReader):
         self._listing = Lock()
         self._in_columns: list[RecordFile] = []
         """Those with columns in memory, the one that was asked for last at the end."""
-        self._last: dict[Path, RunStatus] = {}
-        """As they were read last."""
-        self._pulse = Pulse()
+        self._last: dict[Path, tuple[RunStatus, float]] = {}
+        """As they were read last, and when by the clock."""
+        self._pulse = Pulse(clock)
         self._lock = Lock()
 
     @override
     def runs(self) -> list[RunStatus]:
-        """A list that took long is good for ten times as long: however many ask, about a tenth of a core makes it."""
+        """A list is kept for ten times as long as it took, so that many clients cost a tenth of a core."""
         with self._listing:
-            begun_s = time.monotonic()
+            begun_s = self._clock()
             if begun_s >= self._good_until_s:
                 statuses = [self._status(run_id, path) for run_id, path in self._list().items()]
                 self._statuses = sorted(statuses, key=lambda status: status.started, reverse=True)
-                now_s = time.monotonic()
-                self._good_until_s = now_s + 10.0 * (now_s - begun_s) - _ALWAYS_NEW_S
+                now_s = self._clock()
+                self._good_until_s = now_s + min(10.0 * (now_s - begun_s), MAX_KEPT_S) - _ALWAYS_NEW_S
             return [*self._statuses]
 
     @override
@@ -181,13 +187,14 @@ class DiskReader(RunReader):
         try:
             status = self._read_status(run_id, path)
         except Exception as error:  # whatever a directory holds, it must not hide the other runs
-            last = self._last.get(path)
-            if isinstance(error, OSError) and error.errno in _PASSING and last is not None:
+            last, read_s = self._last.get(path, (None, 0.0))
+            is_young = self._clock() - read_s < SILENT_AFTER.total_seconds()
+            if isinstance(error, OSError) and error.errno in _PASSING and last is not None and is_young:
                 return last.suffering("well", f"{STATUS_FILE} cannot be read right now: {error.strerror}")
             return _damaged(run_id, path, f"{path} cannot be read: {one_line(str(error), 300)}")
         if (number := self._records_of(path).num_passed_over) > 0:
             status = status.suffering("well", f"metrics.jsonl: lines that are no records and are passed over: {number}")
-        self._last[path] = status
+        self._last[path] = status, self._clock()
         return status
 
     def _read_status(self, run_id: str, path: Path) -> RunStatus:

@@ -73,6 +73,9 @@ MERGED = "a0: &a0 {x: 1}\n" + "".join(
 )
 
 
+WIDE = f"a: &a {{{', '.join(f'k{number}: 1' for number in range(2000))}}}\nb: {{<<: [{', '.join(['*a'] * 4000)}]}}\n"
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
@@ -83,6 +86,7 @@ MERGED = "a0: &a0 {x: 1}\n" + "".join(
         ("[" * (MAX_DEPTH + 1) + "]" * (MAX_DEPTH + 1), "nested more than 64 deep"),
         (LAUGHS, "more than 5000 values"),
         (MERGED, "not YAML (more than 5000 values by merging)"),
+        (WIDE, "not YAML (more than 5000 values by merging)"),
         ("a: &a {b: {c: *a}}", "nested more than 64 deep"),
         ("!!python/object/apply:os.system [id]", "not YAML (could not determine a constructor"),
         ("!!bool x", "not YAML ('x')"),

@@ -146,8 +146,10 @@ def test_a_key_of_one_method_is_unknown_to_another(file, method, key, said):
         (
             '"rng": self.rng.bit_generator.state',
             '"rng": object()',
-            "mine.py: state gave 'rng': Object of type object is not",
+            "mine.py: state gave what cannot be saved: Object of type object is not",
         ),
+        ("np.array([self.height])", "self.height", "mine.py: parameters, 'height', gave a float; give one of NumPy's"),
+        ("np.array([self.height])", "np.array(['high'])", "mine.py: state gave what cannot be saved: "),
     ],
 )
 def test_an_error_of_the_method_names_its_line(file, tmp_path, monkeypatch, old, new, said):

@@ -63,10 +63,20 @@ def test_another_run_with_the_same_id_in_redis_is_not_shown_or_stopped(reader, r
     write_status(root, "cube", identity="ours", iteration=3, heartbeat=datetime.now(UTC) - timedelta(seconds=5))
     for shown in (reader.run("cube"), next(run for run in reader.runs() if run.run_id == "cube")):
         assert (shown.identity, shown.iteration) == ("ours", 3)
-        assert "another run with the id cube" in shown.warnings[0]
+        assert "two runs have the id cube" in shown.warnings[0]
+        assert "the second is not shown" in shown.warnings[0]
     reader.request_stop("cube")
     assert (root / "cube" / "stop").exists()
     assert not RedisReader(redis.address).run("cube").stopping
+    write_status(root, "cube", identity="ours", iteration=3, state="finished")
+    shown = reader.run("cube")
+    assert (shown.identity, shown.iteration, len(shown.warnings)) == ("theirs", 7, 1)
+    assert "curves and files shown here are those of the first" in shown.warnings[0]
+    reader.request_stop("cube")
+    assert RedisReader(redis.address).run("cube").stopping
+    client.delete(run_key("cube", "stop"))
+    client.set(key, status("cube", iteration=7, identity="theirs", state="finished").model_dump_json())
+    assert (reader.run("cube").identity, reader.run("cube").warnings) == ("ours", ())
     client.set(key, sound)
 
 

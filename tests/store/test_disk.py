@@ -162,8 +162,9 @@ def test_the_runs_of_a_study_are_listed_with_the_others_under_its_name(tmp_path)
 
 
 @pytest.mark.parametrize(("error", "shown"), [(errno.ESTALE, "running"), (errno.EACCES, "interrupted")])
-def test_a_status_that_cannot_be_read_for_a_moment(told, monkeypatch, error, shown):
-    reader = told(a_status(num_env_steps=700))
+def test_a_status_that_cannot_be_read_for_a_moment(told, tmp_path, clock, monkeypatch, error, shown):
+    told(a_status(num_env_steps=700))
+    reader = DiskReader(tmp_path, clock=clock)
     before = reader.run("cube")
 
     def fail(*_):
@@ -172,6 +173,9 @@ def test_a_status_that_cannot_be_read_for_a_moment(told, monkeypatch, error, sho
     with monkeypatch.context() as patched:
         patched.setattr(disk_reader, "read_regular", fail)
         found = reader.run("cube")
+        clock.now_s += 61.0
+        assert reader.run("cube").state == "interrupted"  # that is no moment
+    clock.now_s -= 61.0
     assert found.state == shown
     if shown == "running":
         assert (found.num_env_steps, len(found.warnings)) == (700, 1)
@@ -179,21 +183,21 @@ def test_a_status_that_cannot_be_read_for_a_moment(told, monkeypatch, error, sho
     assert reader.run("cube") == before
 
 
-def test_a_list_that_takes_long_is_made_once_for_many(told, monkeypatch):
-    reader = told(a_status(iteration=1))
-    now_s, made = [0.0], []
+def test_a_list_that_takes_long_is_made_once_for_many(told, tmp_path, clock, monkeypatch):
+    told(a_status(iteration=1))
+    reader, took_s, made = DiskReader(tmp_path, clock=clock), [0.3], []
+    clock.now_s = 0.0
 
     def slow(*_, status=reader._status):
-        made.append(now_s[0])
-        now_s[0] += 0.3
+        made.append(clock.now_s)
+        clock.now_s += took_s[0]
         return status(*_)
 
-    monkeypatch.setattr(disk_reader.time, "monotonic", lambda: now_s[0])
     monkeypatch.setattr(reader, "_status", slow)
-    for asked_s in (0.0, 0.4, 2.7, 2.9):
-        now_s[0] = max(asked_s, now_s[0])
+    for asked_s, takes_s in ((0.0, 0.3), (0.4, 0.3), (2.7, 0.3), (2.9, 60.0), (67.0, 0.01), (68.0, 0.01), (68.1, 0.01)):
+        clock.now_s, took_s[0] = max(asked_s, clock.now_s), takes_s
         assert [run.iteration for run in reader.runs()] == [1]
-    assert made == [0.0, 2.9]
+    assert made == [0.0, 2.9, 68.0, 68.1]
 
 
 @pytest.mark.parametrize("size", [100, 17_000, 44_000])

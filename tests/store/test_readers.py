@@ -194,7 +194,7 @@ def test_a_run_whose_process_is_gone_does_not_run_for_ever(store):
     if isinstance(store, Disk):  # nobody has the lock
         assert (seen.state, seen.stopping, seen.heartbeat) == ("interrupted", False, silent.heartbeat)
         assert_one_line(seen.last_error, "vanished", silent.heartbeat.isoformat(timespec="seconds"), "--resume")
-        assert store.reader.runs() == [seen]
+        assert DiskReader(store.reader.root).runs() == [seen]  # this one may keep a list that took long
     else:  # it may just not reach Redis
         assert (seen.state, seen.condition, seen.last_error) == ("running", "silent", None)
         assert re.search(r"Redis has heard nothing of it for 6\d s", seen.warnings[-1])

@@ -136,9 +136,6 @@ class GoalWorlds:
         Args:
             worlds: (N,) where.
             goal: (N, 3 K) or (1, 3 K) in place of random goals, metres; random numbers go on as with these.
-
-        Raises:
-            TandemError: an object at its given goal would be inside something.
         """
         self._has_begun = True
         index = np.flatnonzero(worlds).tolist()
@@ -150,12 +147,6 @@ class GoalWorlds:
             self.rules.place(self._random[world], here)
             self._goal[here] = self.rules.draw(self._random[world], here)
         if goal is not None:
-            goal = np.broadcast_to(goal, self._goal.shape)
-            for bad in goal[self.rules.inside_things(goal)]:
-                raise TandemError(
-                    f"reset: options['goal'] ({in_metres(bad)}) m: an object would be inside an obstacle, or a side of "
-                    "the box, where these are in this episode"
-                )
             self._goal[:] = goal
 
     def _given(self, options: dict[str, Any] | None) -> StateArray | None:
@@ -235,8 +226,8 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
     - reward: 1 at every step each object is within ``success_distance_m`` of its goal, else 0 (paper, downstream
       tasks); or what the task says.
     - never terminates; truncated where the physics diverged, or the steps of the task are over. Another length:
-      ``gymnasium.make("tandem/Push-v1", max_episode_steps=100)``, with -1 for no end; or
-      ``TabletopEnv(task=replace(find_task("push"), episode_steps=100))``.
+      ``gymnasium.make("tandem/Push-v1", max_episode_steps=100)``, with -1 for no end. In ``tandem/Tabletop-v1`` the
+      steps of the task count: ``task=replace(find_task("push"), episode_steps=100)``.
 
     ``info`` holds ``is_success`` (bool) and, after a step, ``diverged`` (bool).
 
@@ -255,8 +246,8 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012 - as the base class has it
-    _counts_steps = True
-    """Whether it ends episodes by the steps of the task."""
+    _has_time_limit = False
+    """Whether something around it ends the episodes of a task that is given by name."""
 
     def __init__(
         self,
@@ -272,6 +263,7 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
             raise TandemError(f"TabletopEnv: render_mode = {render_mode!r}; choose rgb_array or None")
         super().__init__(1, 1, config, task, success_distance_m)
         self.np_random, self.render_mode = self._random[0], render_mode
+        self._counts_steps = not (self._has_time_limit and isinstance(task, str))
         step_s = self.config.physics_step_s * self.config.num_substeps
         self.metadata = {**self.metadata, "render_fps": round(1.0 / step_s)}
         self.observation_space = goal_space(self.config)
@@ -343,7 +335,7 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
 class TimeLimitedEnv(TabletopEnv):
     """A ``TabletopEnv`` whose episodes ``gymnasium.wrappers.TimeLimit`` ends, as ``gymnasium.make`` puts around it."""
 
-    _counts_steps = False
+    _has_time_limit = True
 
 
 def _first(observation: Observation) -> Observation:

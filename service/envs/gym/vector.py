@@ -43,7 +43,7 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
     Raises:
         TandemError: unknown ``task``, goals that the world cannot have, a distance that is not positive, or a
             ``render_mode``.
-        ValueError: ``num_envs`` or ``max_episode_steps`` below 1.
+        ValueError: ``num_envs`` below 1, or ``max_episode_steps`` below 1 and not -1.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - as the base class has it

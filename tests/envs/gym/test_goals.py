@@ -147,25 +147,6 @@ def test_goals_of_a_function_are_clear_of_what_stands_there():
         assert np.ptp(goals, axis=0)[1] > 0.2
 
 
-BESIDE = {"obstacles": [{"shape": "box", "size_m": (0.08, 0.08, 0.06)}]}
-
-
-@pytest.mark.parametrize(("world", "out_of"), [({"fixture": "box"}, (0.0475, 0.0, 0.03)), (BESIDE, (0.0, 0.03, 0.03))])
-def test_a_goal_inside_what_stands_elsewhere_in_every_episode_is_refused(world, out_of):
-    """A side of the box is 4.5 to 5 cm from its middle; the obstacle reaches 4 cm from its own."""
-    env = TabletopEnv(WorldConfig(**world), task=Task("Table", goals="table"))
-    env.reset(seed=0)
-    places = env._worlds.places
-    inside = (places.box if places.box.size else places.obstacles[:, 0])[0] + out_of
-    beside = inside + np.array([0.0, 0.0, 0.15])
-    np.testing.assert_array_equal(env.reset(seed=0, options={"goal": beside})[0]["desired_goal"], np.float32(beside))
-    with pytest.raises(
-        TandemError, match=r"options\['goal'\] \(.*\) m: an object would be inside an obstacle, or a side"
-    ):
-        env.reset(seed=0, options={"goal": inside})
-    env.close()
-
-
 @pytest.mark.parametrize("name", ["starts", "goals"])
 def test_places_of_a_function_are_not_inside_a_side_of_the_box(name):
     low, high = (-0.2, -0.15, 0.03), (0.1, 0.15, 0.03)
