@@ -82,6 +82,7 @@ def dataset(
     video: Annotated[
         Path | None, typer.Option(metavar="FILE", help=f"Film of the first {_MAX_FILMED}, too: .mp4 or .gif.")
     ] = None,
+    primitives: ActsWithOption = None,
     registry: SourceOption = SOURCE,
     quiet: QuietOption = False,
 ) -> None:
@@ -98,7 +99,7 @@ def dataset(
         if video is not None:
             check_format(video)
             check_place(video)
-        trained = load(players, registry).expect("primitives", "orchestrator", by="tandem dataset")
+        trained = load(players, registry, primitives).expect("primitives", "orchestrator", by="tandem dataset")
     trained.goal_kind  # noqa: B018 - what it plays is paid by distance alone
     config = trained.config.model_copy(update={"world": trained.world})
     if trained.alice is not None and isinstance(config, SelfPlayConfig) and goals is None:
@@ -114,7 +115,7 @@ def dataset(
         played = played_episodes(recorded)
         if video is not None:
             write_episode_video(recorded.first(_MAX_FILMED), config.world, video)
-    place = write_dataset(name, played, config, trained.label)
+    place = write_dataset(name, played, config, trained.label, success_distance_m=trained.success_distance_m)
     typer.echo(f"{len(played)} episodes, {sum(len(each.actions) for each in played):,} steps: {name} in {place}")
     if video is not None:
         typer.echo(f"video: {video}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,8 +15,9 @@ from pydantic import ValidationError
 
 from service.base.errors import TandemError, in_metres
 from service.base.files import check_place
+from service.base.jsonl import JsonlWriter
 from service.base.types import StateArray
-from service.cli.common import CHAMPION, REFERENCE, SOURCE, CommandGroup, SourceOption, print_json
+from service.cli.common import CHAMPION, REFERENCE, SOURCE, ActsWithOption, CommandGroup, SourceOption, print_json
 from service.cli.evaluate import parse_points
 from service.config.load import explained
 from service.config.tree import apply_override
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from service.robot.backends import Backend, BackendConfig
     from service.robot.limits import Box
     from service.robot.loop import BridgeConfig
+    from service.robot.running import Outcome
 
 robot_app = typer.Typer(name="robot", help="Frozen policies on a robot.", cls=CommandGroup, no_args_is_help=True)
 
@@ -51,6 +54,7 @@ _DeadMan = Annotated[
 def run(
     robot: _Robot,
     policy: _Policy = CHAMPION,
+    primitives: ActsWithOption = None,
     goal: Annotated[
         str | None, typer.Option(metavar="X,Y,Z", help="Metres, of one object after the other; default: random ones.")
     ] = None,
@@ -73,7 +77,7 @@ def run(
     from service.robot.loop import Bridge
     from service.robot.running import open_log, play
 
-    config, described, player = _bridge_config(overrides), read_backend(robot), _load(policy, registry)
+    config, described, player = _bridge_config(overrides), read_backend(robot), _load(policy, registry, primitives)
     goal_m = None if goal is None else parse_goal(goal, player.world)
     gain = (1.0, 1.0, 1.0)
     if calibration is not None:
@@ -88,8 +92,9 @@ def run(
             if dry_run:
                 _print_step(row, bridge.safe.limiter.box, to_stderr=as_json)
 
-        def ready(episode: int, goal_m: StateArray) -> None:
-            wait(f"goal {episode + 1} of {episodes}, {in_metres(goal_m)}: put arm and objects to their start")
+        def ready(episode: int, goal_m: StateArray | None) -> None:
+            where = "to be drawn from where objects lie" if goal_m is None else in_metres(goal_m)
+            wait(f"goal {episode + 1} of {episodes}, {where}: put arm and objects to their start")
 
         bridge = Bridge(
             player.policy, backend.robot, backend.poses, player.world, config,
@@ -101,10 +106,13 @@ def run(
             "robot": described.model_dump(mode="json"),
             "bridge": config.model_dump(mode="json"),
             "calibration": None if calibration is None else str(calibration),
+            "gain": gain,
+            "seed": seed,
+            "dry_run": dry_run,
         }
         written = None if log is None else open_log(log, header, player.world)
         outcomes = []
-        for outcome in play(
+        played = play(
             bridge,
             backend,
             player,
@@ -113,7 +121,8 @@ def run(
             num_steps=steps or player.num_steps,
             seed=seed,
             ready=ready,
-        ):
+        )
+        for outcome in _logged(played, written, lambda: bridge.safe.stopped):
             outcomes.append(outcome)
             if not as_json:
                 reached = "reached" if outcome.reached else "not reached"
@@ -131,6 +140,7 @@ def calibrate(
     robot: _Robot,
     out: Annotated[Path, typer.Option(metavar="FILE", help="YAML to write, for tandem robot run.")],
     policy: _Policy = CHAMPION,
+    primitives: ActsWithOption = None,
     overrides: _Set = None,
     dead_man: _DeadMan = None,
     registry: SourceOption = SOURCE,
@@ -139,7 +149,7 @@ def calibrate(
     from service.robot import calibrate as measuring
     from service.robot.backends import read_backend
 
-    config, described, player = _bridge_config(overrides), read_backend(robot), _load(policy, registry)
+    config, described, player = _bridge_config(overrides), read_backend(robot), _load(policy, registry, primitives)
     check_place(out)  # now, not after the arm has moved
     with _connected(described, player, 0, dead_man) as (backend, held, wait):
         wait("take everything out of the arm's way")
@@ -164,6 +174,20 @@ def replay(
     world, recorded = read_log(log)
     write_episode_video(recorded, world, out)
     typer.echo(f"video: {out}")
+
+
+def _logged(played: Iterator[Outcome], log: JsonlWriter | None, stopped: Callable[[], str | None]) -> Iterator[Outcome]:
+    """Append what came of each goal to a log, and why the robot was stopped."""
+    num = 0
+    try:
+        for num, outcome in enumerate(played, start=1):
+            if log is not None:
+                log.append({"episode": num - 1, **asdict(outcome)})
+            yield outcome
+    except BaseException:
+        if log is not None and (reason := stopped()) is not None:
+            log.append({"episode": num, "stopped": reason})
+        raise
 
 
 def parse_goal(text: str, world: WorldConfig) -> StateArray:
@@ -192,11 +216,11 @@ def _bridge_config(overrides: list[str] | None) -> BridgeConfig:
         raise TandemError(f"--set: {explained(error, BridgeConfig)}") from None
 
 
-def _load(policy: str, registry: str) -> Trained:
+def _load(policy: str, registry: str, primitives: str | None) -> Trained:
     from service.registry.loading import load
     from service.robot.running import for_robot
 
-    return for_robot(load(policy, registry))
+    return for_robot(load(policy, registry, primitives))
 
 
 @contextlib.contextmanager
@@ -213,7 +237,7 @@ def _connected(
 
     if dead_man not in (None, "key", "none"):
         raise TandemError(f"--dead-man {dead_man!r}: choose key or none")
-    with StopSignals(), contextlib.ExitStack() as stack:
+    with StopSignals() as signals, contextlib.ExitStack() as stack:
         backend = stack.enter_context(contextlib.closing(connect(described, player.world, seed=seed)))
         harmless = backend.simulator is not None or dry_run
         needed = dead_man == "key" or (dead_man is None and not harmless)
@@ -228,8 +252,12 @@ def _connected(
                 if not sys.stdin.readline():
                     raise TandemError("standard input has ended, so nobody can press Enter: run this in a terminal")
 
+        def held() -> bool:
+            # a back-end of a user's may have swallowed what the signal raised
+            return signals.first is None and (key or always_held)()
+
         with naming_errors(described):
-            yield backend, key or always_held, wait
+            yield backend, held, wait
 
 
 def _print_step(row: dict[str, Any], box: Box, *, to_stderr: bool) -> None:

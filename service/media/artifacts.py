@@ -61,10 +61,16 @@ def _draw_coverage(directory: RunDirectory, trained: Trained) -> Path:
 
 
 def _draw_video(directory: RunDirectory, trained: Trained) -> Path:
-    kind = "skills" if trained.kind == "skills" else "rounds" if trained.alice is not None else "episodes"
+    kind = "skills" if trained.kind == "skills" else "rounds" if _has_rounds(trained) else "episodes"
     path = directory.path / f"{kind}.mp4"
     directory.keep_recording(path)
     return film(trained, path, NUM_RECORDED_ROUNDS if kind == "rounds" else NUM_RECORDED_EPISODES, _SEED)
+
+
+def _has_rounds(trained: Trained) -> bool:
+    """Whether it is a run in which Alice plays."""
+    config = trained.config
+    return trained.alice is not None and isinstance(config, SelfPlayConfig) and config.game.alice_plays
 
 
 def paths_of(trained: Trained, num: int, num_steps: int, seed: int) -> tuple[StateArray, str]:
@@ -104,11 +110,12 @@ def film(
     Raises:
         TandemError: see ``write_video``; or no goal leads what was trained.
     """
+    trained = trained.nominal  # which pictures show
     config = trained.config
     if isinstance(config, SkillDiscoveryConfig) and trained.kind == "skills" and trained.task is None:
         steps = config.skills.episode_steps
         recorded = recording.record_skills(trained.skills, config.world, num_skills=num, num_steps=steps, seed=seed)
-    elif isinstance(config, SelfPlayConfig) and trained.alice is not None and goals is None:
+    elif isinstance(config, SelfPlayConfig) and trained.alice is not None and _has_rounds(trained) and goals is None:
         rounds = recording.record_rounds(config, trained.alice, trained.policy, num_rounds=num, seed=seed)
         return video.write_video(rounds, config.world, path, options)
     else:

@@ -78,7 +78,9 @@ def check_name(name: str) -> str:
     return full
 
 
-def write_dataset(name: str, played: Sequence[Played], config: Config, label: str) -> Path:
+def write_dataset(
+    name: str, played: Sequence[Played], config: Config, label: str, *, success_distance_m: float
+) -> Path:
     """Write a Minari data set into the directory MINARI_DATASETS_PATH, or Minari's own; each turn is an episode.
 
     Observations are those of ``TabletopEnv``: ``observation`` (T + 1, P), ``achieved_goal`` and ``desired_goal``
@@ -91,6 +93,7 @@ def write_dataset(name: str, played: Sequence[Played], config: Config, label: st
         played: at least one.
         config: of the run that the players come from.
         label: where they come from, such as ``panda-cube@3``.
+        success_distance_m: greatest distance that is paid.
 
     Returns:
         The data set's directory.
@@ -103,14 +106,14 @@ def write_dataset(name: str, played: Sequence[Played], config: Config, label: st
     with needs_extra("data", "tandem dataset"):
         import minari
 
-    description = {"players": label, "success_distance_m": config.success_distance_m}
+    description = {"players": label, "success_distance_m": success_distance_m}
     about = {**description, "world": config.world.model_dump(mode="json")}
     try:
         with os_errors("write", place), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # it asks for an author, and for more that is not known here
             minari.create_dataset_from_buffers(
                 full,
-                list(_buffers(played, config)),
+                list(_buffers(played, config, success_distance_m)),
                 observation_space=goal_space(config.world),
                 action_space=action_space(),
                 algorithm_name="tandem",
@@ -124,7 +127,7 @@ def write_dataset(name: str, played: Sequence[Played], config: Config, label: st
     return place
 
 
-def _buffers(played: Sequence[Played], config: Config) -> Iterator[object]:
+def _buffers(played: Sequence[Played], config: Config, success_distance_m: float) -> Iterator[object]:
     from minari.data_collector import EpisodeBuffer
 
     longest = max(len(each.states) for each in played)
@@ -133,7 +136,7 @@ def _buffers(played: Sequence[Played], config: Config) -> Iterator[object]:
         blocked = config.game.blocked_gripper_fraction
     with WorldBatch(config.world, longest, num_threads=1, blocked_fraction=blocked) as worlds:
         for each in track(played, "writing the data set", len(played), "episodes"):
-            yield EpisodeBuffer(**_arrays(each, worlds, config.success_distance_m))
+            yield EpisodeBuffer(**_arrays(each, worlds, success_distance_m))
 
 
 def _arrays(played: Played, worlds: WorldBatch, success_distance_m: float) -> dict[str, object]:

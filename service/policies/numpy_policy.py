@@ -27,6 +27,7 @@ from service.policies.parameters import (
     shape_of,
 )
 
+_SMALLEST = float(np.finfo(np.float32).tiny)
 _HALF_LOG_TWO_PI = np.float32(0.5 * math.log(2.0 * math.pi))
 
 
@@ -126,18 +127,15 @@ class NumpyMCPPolicy(NumpyPolicy):
         """Mean and std, (..., A) each, of the primitives at (..., P) positions under given (..., K) weights.
 
         Raises:
-            PolicyError: the last axis is not P, or not K; a weight below 0, all of a row 0, or weights beyond float32.
+            PolicyError: the last axis is not P, or not K; a weight that is below 0 or not finite, or all of a row 0.
         """
         weights = np.asarray(weights, dtype=np.float32)
         if weights.shape[-1:] != (self.num_primitives,):
             raise PolicyError(f"weights: expected shape (..., {self.num_primitives}), got {weights.shape}")
-        with np.errstate(all="ignore"):
-            mean, std = self._compose(positions, weights)
-        if not (weights.min(initial=0.0) >= 0.0 and np.isfinite(mean).all() and np.isfinite(std).all()):
-            raise PolicyError(
-                "weights: give numbers of at least 0, in each row one above 0, and none too large or small"
-            )
-        return mean, std
+        greatest = weights.max(axis=-1, initial=0.0)
+        if not (np.isfinite(weights).all() and weights.min(initial=0.0) >= 0.0 and (greatest >= _SMALLEST).all()):
+            raise PolicyError("weights: give finite numbers of at least 0, and in each row one above 0")
+        return self.composed(positions, weights)
 
     def distribution(self, observation: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and std, (..., A) each, of the composition at (..., O) observations.
@@ -145,9 +143,10 @@ class NumpyMCPPolicy(NumpyPolicy):
         Raises:
             PolicyError: the observation's last axis is not O.
         """
-        return self._compose(np.asarray(observation)[..., : self.num_positions], self.gate(observation))
+        return self.composed(np.asarray(observation)[..., : self.num_positions], self.gate(observation))
 
-    def _compose(self, positions: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def composed(self, positions: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As ``compose``, of (..., K) float32 weights that a network gave: they are not checked, and NaN gives NaN."""
         mean, variance = forward.compose(weights, *self.primitives(positions))
         return mean, np.sqrt(variance)
 

@@ -64,7 +64,7 @@ def compose_actions(
         actions: (..., K) of a learner; with a residual (..., K + 4).
         residual: size of the greatest action that is added (Silver et al. 2018; Johannink et al. 2019).
     """
-    mean, _ = primitives.compose(positions, action_weights(actions[..., : primitives.num_primitives]))
+    mean, _ = primitives.composed(positions, action_weights(actions[..., : primitives.num_primitives]))
     if residual:
         mean += np.float32(residual) * np.clip(actions[..., primitives.num_primitives :], -1.0, 1.0)
     return mean

@@ -68,17 +68,19 @@ class Backend:
     """None for a robot that people have to put back by hand."""
 
     def begin(self, object_m: StateArray) -> None:
-        """Begin an episode of a simulator, K objects at (3 K,) metres; nothing is on its way from the last one."""
-        assert self.simulator is not None
-        self.simulator.reset(object_m)
+        """Begin an episode, in a simulator with K objects at (3 K,) metres; nothing is on its way from the last one."""
+        if self.simulator is not None:
+            self.simulator.reset(object_m)
         for part in (self.robot, self.poses):
             if isinstance(part, (DisturbedRobot, DisturbedPoses)):
                 part.forget()
 
     def close(self) -> None:
-        """Let go of both."""
-        self.poses.close()
-        self.robot.close()
+        """Let go of both, of the robot first."""
+        try:
+            self.robot.close()
+        finally:
+            self.poses.close()
 
 
 class BackendConfig(FrozenModel):

@@ -100,7 +100,8 @@ def calibrate(
     """
     from service.robot.mujoco_robot import MujocoRobot
 
-    wanted, _ = measure_response(MujocoRobot(world), world, _AS_IN_TRAINING)
+    empty = world.model_copy(update={"fixture": "none", "fixtures": ()})  # as the robot's table is now
+    wanted, _ = measure_response(MujocoRobot(empty), world, _AS_IN_TRAINING)
     full = config.model_copy(update={"pace": 1.0})
     found, delay_steps = measure_response(robot, world, full, held=held)
     if not all(_LEAST_SHARE <= share <= _GREATEST_SHARE for share in found):

@@ -31,8 +31,6 @@ Record = Callable[[dict[str, Any]], None]
 
 _MORE_SETTLE_S = 0.5
 """Beyond the time that braking from the greatest speed takes."""
-_KEPT_STATES = 16
-"""States of the robot that an object's pose may belong to, one a control step."""
 
 
 class BridgeConfig(FrozenModel):
@@ -92,7 +90,7 @@ class Bridge:
         self.safe = SafeRobot(robot, poses, config.safety, world, held=held, dry_run=dry_run)
         """The only way to the robot."""
 
-    def run(self, goal_m: StateArray, num_steps: int) -> float:
+    def run(self, goal_m: StateArray, num_steps: int, *, truth: Callable[[], StateArray] | None = None) -> float:
         """Play one goal, and come to rest.
 
         What is recorded of a step: ``step``; ``time_s`` and ``due_s`` of its begin; ``effector_m``, ``fingers_m``,
@@ -103,10 +101,11 @@ class Bridge:
         Args:
             goal_m: (3 K,) where each object should go, metres.
             num_steps: control steps.
+            truth: of a simulator, (3 K,) where the objects are, metres.
 
         Returns:
-            Distance from the object that is furthest from its goal, as it was last seen, to there, metres; NaN where
-            nothing sees them.
+            Distance from the object that is furthest from its goal to there at the end of the last step, metres: in
+            truth, or else as it was last seen, and NaN where nothing sees them.
 
         Raises:
             RobotError: the robot was stopped; the message says why.
@@ -115,7 +114,8 @@ class Bridge:
         if begin is not None:
             begin()
         self._commands = deque([np.zeros(ACTION.size)] * self._num_commands, maxlen=self._num_commands)
-        self._states: deque[RobotState] = deque(maxlen=_KEPT_STATES)
+        most = math.ceil(self._config.safety.watch.max_pose_age_s / self._step_s) + 2
+        self._states: deque[RobotState] = deque(maxlen=most)  # to which an object's pose may belong, one a step
         with self.safe.guarded():
             self.safe.start(self._tick_s)
             start_s = self._robot.now_s()
@@ -133,7 +133,7 @@ class Bridge:
                         self._record(row)
             end_s = start_s + num_steps * self._step_s
             self.safe.measure(end_s)
-            object_m = self.safe.object.position_m
+            object_m = self.safe.object.position_m if truth is None else truth().copy()
             self._settle(end_s)
         return float(distances(object_m, goal_m).max())
 

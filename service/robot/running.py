@@ -70,7 +70,7 @@ def play(
     num_episodes: int,
     num_steps: int,
     seed: int,
-    ready: Callable[[int, StateArray], None],
+    ready: Callable[[int, StateArray | None], None],
 ) -> Iterator[Outcome]:
     """Play goals; a simulator starts each with its objects anywhere, as an evaluation does.
 
@@ -83,7 +83,8 @@ def play(
         num_episodes: how many.
         num_steps: of each.
         seed: of starts and goals.
-        ready: called with the episode's number and its goal, before anything moves: people put things back then.
+        ready: called with the episode's number and its goal, before anything moves: people put things back then. The
+            goal is None where it depends on where they put them.
 
     Raises:
         RobotError: the robot was stopped.
@@ -95,15 +96,15 @@ def play(
     if goal_m is None and (backend.simulator is not None or not depends):
         goals = draw_goals(kind, rng, policy.world, policy.success_distance_m, places)
     for episode in range(num_episodes):
-        if backend.simulator is not None:
-            backend.begin(places.object[episode])
-        elif goal_m is None and depends:
-            goals[episode] = _goal_from(backend, rng, policy)
+        simulator = backend.simulator
+        backend.begin(places.object[episode])
         goal = goals[episode] if goal_m is None else goal_m
-        ready(episode, goal)
-        distance_m = bridge.run(goal, num_steps)
-        if backend.simulator is not None:
-            distance_m = float(distances(backend.simulator.object_position(), goal).max())
+        if simulator is None and goal_m is None and depends:
+            ready(episode, None)
+            goal = _goal_from(backend, rng, policy)
+        else:
+            ready(episode, goal)
+        distance_m = bridge.run(goal, num_steps, truth=None if simulator is None else simulator.object_position)
         yield Outcome(goal, distance_m, distance_m <= policy.success_distance_m)
 
 
@@ -117,8 +118,11 @@ def _starts(rng: np.random.Generator, num: int, world: WorldConfig, *, simulated
 
 def _goal_from(backend: Backend, rng: np.random.Generator, policy: Trained) -> StateArray:
     """(3 K,) a goal for objects where they lie: it is behind the wall from there, or asks some to stay."""
-    object_m = backend.poses.read().position_m
-    if not np.isfinite(object_m).all():
+    pose = backend.poses.read()
+    object_m = (
+        np.full(3 * policy.world.num_objects, np.nan) if pose is None else np.asarray(pose.position_m, dtype=float)
+    )
+    if object_m.shape != (3 * policy.world.num_objects,) or not np.isfinite(object_m).all():
         raise RobotError("an object is not seen: put it on the table in view of what sees it")
     if policy.world.fixture == "box":
         raise RobotError(f"{policy.label} brings the object into a box, and nothing tells a bridge where it is: --goal")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 from pydantic import Field
@@ -100,6 +101,11 @@ class SafeRobot:
         self.config, self._robot, self._poses, self._held, self._dry_run = config, robot, poses, held, dry_run
         self.limiter = SetPointLimiter(config.box(world), config.max_speed_m_s, config.max_acceleration_m_s2)
         self._widest_m, self._num_objects = config.widest_m(world), world.num_objects
+        if config.min_width_m > self._widest_m:
+            raise ConfigError(
+                f"safety.min_width_m = {config.min_width_m:g}: the gripper may open by {self._widest_m:g} m at most; "
+                "give less"
+            )
         self.stopped: str | None = None
         """Why the robot was stopped; None while it was not."""
         self.width_m = np.nan
@@ -164,7 +170,10 @@ class SafeRobot:
             return f"late: a step came {1e3 * (now_s - due_s):.0f} ms after it was due"
         if not self._held():
             return "the dead-man's switch was let go"
-        self.state: RobotState = self._robot.read()
+        state = self._robot.read()
+        # a back-end may go on writing into its arrays
+        effector_m, fingers_m = (np.array(each, dtype=np.float64) for each in (state.effector_m, state.fingers_m))
+        self.state: RobotState = replace(state, effector_m=effector_m, fingers_m=fingers_m)
         pose = None if self._poses is None else self._poses.read()
         # Reading may have taken long; what was read is as old as it is now.
         now_s = self._robot.now_s()

@@ -55,6 +55,11 @@ class StateWatch:
         """What is wrong with a measurement, if anything."""
         if not state.connected:
             return "the robot takes no more commands"
+        shapes = np.shape(state.effector_m), np.shape(state.fingers_m)
+        if shapes != ((3,), (2,)):
+            return (
+                f"the robot's state has an effector of the shape {shapes[0]} and fingers of {shapes[1]}: (3,) and (2,)"
+            )
         if not (np.isfinite(state.effector_m).all() and np.isfinite(state.fingers_m).all()):
             return "the robot's state is not finite"
         age_s = now_s - state.time_s

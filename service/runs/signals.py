@@ -1,4 +1,4 @@
-"""Handling of SIGINT and SIGTERM: a run ends where it can be resumed, and the process says which signal it was."""
+"""Handling of SIGINT, SIGTERM and SIGHUP: a run ends where it can be resumed; the process says which signal it was."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from typing import Self
 PASSED_ON = signal.SIGUSR1
 """A stop that the process above passes on. It counts only where no other signal came: a supervisor, such as Ray's for
 jobs, signals a process and those below it, and what comes twice that way must not count as a second signal."""
-STOPPING = (signal.SIGINT, signal.SIGTERM, PASSED_ON)
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, PASSED_ON)
+"""The third comes where a terminal is closed or a connection drops; under ``nohup`` it is ignored, and stays so."""
 PARENT = "TANDEM_STUDY_PROCESS"
 """Variable of the environment with the id of the process above that a run of a study ends with."""
 _PR_SET_PDEATHSIG = 1
@@ -43,10 +44,11 @@ class StopSignals:
         self.first: int | None = None
         """The first signal that came."""
         self._ask: Callable[[], None] | None = None
-        self._previous = {number: signal.getsignal(number) for number in STOPPING}
+        before = {number: signal.getsignal(number) for number in STOPPING}
+        self._previous = {number: handler for number, handler in before.items() if not _is_ignored(number, handler)}
 
     def __enter__(self) -> Self:
-        for number in STOPPING:
+        for number in self._previous:
             signal.signal(number, self._handle)
         return self
 
@@ -79,6 +81,10 @@ class StopSignals:
         if ask is None:
             raise InterruptError(number)
         ask()
+
+
+def _is_ignored(number: int, handler: object) -> bool:
+    return number == signal.SIGHUP and handler == signal.SIG_IGN
 
 
 def stop_with_parent() -> None:

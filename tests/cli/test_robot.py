@@ -42,6 +42,8 @@ def test_goals_are_played_logged_and_drawn_from_the_log(tmp_path):
     assert json.loads(ran.stdout) == {"policy": "panda-cube@7 (bundled)", "robot": "mujoco", "reached": 0, "goals": 2}
     header, *rows = read_jsonl(log)
     assert header["bridge"]["set_points_per_step"] == 2
+    assert (header["seed"], header["dry_run"], header["gain"]) == (0, False, [1.0, 1.0, 1.0])
+    assert [rows.pop(6)["reached"], rows.pop()["reached"]] == [False, False]  # what came of each goal
     assert [(row["episode"], row["step"]) for row in rows] == [
         (episode, step) for episode in (0, 1) for step in range(6)
     ]
@@ -222,19 +224,22 @@ def test_a_key_that_a_simulator_is_given_is_waited_for(monkeypatch):
     assert "then hold any key; letting go stops the robot" in ran.stderr
 
 
-def test_ctrl_c_stops_the_robot_first(monkeypatch, default_signals):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize("swallowed", [False, True])
+def test_a_signal_stops_the_robot_first(monkeypatch, default_signals, number, swallowed):
     robot, closed = FakeRobot(), []
     command = robot.command
 
     def interrupted(sent):
         command(sent)
         if len(robot.commands) == 5:
-            os.kill(os.getpid(), signal.SIGINT)
+            with contextlib.suppress(BaseException) if swallowed else contextlib.nullcontext():
+                os.kill(os.getpid(), number)
 
     robot.command, robot.close = interrupted, lambda: closed.append(len(robot.stops))
     monkeypatch.setitem(sys.modules, "their", SimpleNamespace(robot=real(robot)))
     ran = invoke("run", "--robot", "their:robot", "--goal", "0,0,0.2", "--dead-man", "none", answers="\n")
-    assert ran.exit_code == 128 + signal.SIGINT
+    assert ran.exit_code == (1 if swallowed else 128 + number)
     assert len(robot.commands) == 5
     assert len(closed) == 1
     assert closed[0] > 0  # it was stopped, then given back

@@ -1,9 +1,11 @@
 import pytest
 
+from service.config import parse_config
 from service.media import artifacts
 from service.media.artifacts import make_artifacts
+from service.registry.loading import load
 from service.store.run_directory import RunDirectory
-from tests.runs.runs import assert_one_line, no_room_above, play
+from tests.runs.runs import TREE, assert_one_line, no_room_above, play
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +27,18 @@ def test_every_picture_by_what_it_shows(directory):
     files = make_artifacts(directory)
     assert list(files) == ["curves", "goals", "coverage", "video"]
     assert all(files[name].stat().st_size > 10_000 for name in ("curves", "goals", "coverage"))
+
+
+def test_a_run_in_which_alice_does_not_play_has_a_film_of_episodes(tmp_path, monkeypatch):
+    game = TREE["game"] | {"alice_plays": False}
+    generator = TREE.get("generator", {}) | {"goal_source": "uniform", "past_opponent_fraction": 0.0}
+    play(tmp_path, parse_config(TREE | {"game": game, "generator": generator}, where="a test"))
+    made = []
+    monkeypatch.setattr(
+        "service.media.video.write_episode_video", lambda recorded, world, path, options: made.append(path)
+    )
+    artifacts._draw_video(RunDirectory(tmp_path), load(tmp_path))
+    assert [path.name for path in made] == ["episodes.mp4"]
 
 
 def test_pictures_for_which_there_is_no_room_are_left_out(directory, caplog):

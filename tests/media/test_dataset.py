@@ -31,7 +31,7 @@ def test_bobs_episodes_are_those_that_the_environment_plays(place):
     recorded = record_episodes(
         Constant(PUSH), CONFIG.world, "table", num_episodes=3, num_steps=5, success_distance_m=0.05, seed=0
     )
-    path = write_dataset("some/bob-v2", played_episodes(recorded), CONFIG, "here")
+    path = write_dataset("some/bob-v2", played_episodes(recorded), CONFIG, "here", success_distance_m=0.05)
     assert path == place / "some" / "bob-v2"
     read = minari.load_dataset("some/bob-v2")
     assert (read.total_episodes, read.total_steps) == (3, 15)
@@ -57,7 +57,7 @@ def test_bobs_episodes_are_those_that_the_environment_plays(place):
 def test_rounds_are_turns_of_both():
     rounds = play_rounds(CONFIG, Constant(PUSH), Constant(NOTHING), num_rounds=66, seed=0)
     assert len(rounds) == 66
-    write_dataset("rounds", played_turns(rounds), CONFIG, "here")
+    write_dataset("rounds", played_turns(rounds), CONFIG, "here", success_distance_m=0.05)
     turns = list(minari.load_dataset("rounds-v0").iterate_episodes())
     alices = [each for each in turns if each.infos["is_alice"].all()]
     bobs = [each for each in turns if not each.infos["is_alice"].any()]
@@ -73,7 +73,7 @@ def test_rounds_without_alice_are_turns_of_bob():
     alone = CONFIG.model_dump(mode="json") | {"generator": {"goal_source": "uniform", "replay_invalid": True}}
     config = SelfPlayConfig.model_validate(alone | {"game": alone["game"] | {"alice_plays": False}})
     rounds = play_rounds(config, Constant(NOTHING), Constant(PUSH), num_rounds=4, seed=0)
-    write_dataset("alone", played_turns(rounds), config, "here")
+    write_dataset("alone", played_turns(rounds), config, "here", success_distance_m=0.05)
     turns = list(minari.load_dataset("alone-v0").iterate_episodes())
     assert len(turns) == 4
     assert not any(each.infos["is_alice"].any() for each in turns)
@@ -99,5 +99,5 @@ def test_a_name_that_is_none_is_refused(place, name):
 def test_half_a_data_set_is_taken_away(place):
     wrong = Played(np.zeros((3, 5)), np.zeros((2, 4), dtype=np.float32), np.zeros(3))
     with pytest.raises(ValueError, match="shape"):
-        write_dataset("half", [wrong], CONFIG, "here")
+        write_dataset("half", [wrong], CONFIG, "here", success_distance_m=0.05)
     assert not (place / "half-v0").exists()

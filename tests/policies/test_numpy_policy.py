@@ -176,7 +176,7 @@ def test_inputs_of_a_wrong_size_are_refused() -> None:
 def test_weights_that_make_no_gaussian_are_refused(weights: list[list[float]]) -> None:
     numpy_policy = NumpyMCPPolicy(export_parameters(make_bob(PolicyConfig())))
     positions = np.zeros((2, 11), dtype=np.float32)
-    with pytest.raises(PolicyError, match="weights: give numbers of at least 0, in each row one above 0"):
+    with pytest.raises(PolicyError, match="weights: give finite numbers of at least 0, and in each row one above 0"):
         numpy_policy.compose(positions, np.float32(weights))
     mean, std = numpy_policy.compose(positions, np.float32([[1, 0, 0, 0]] * 2))
     means, variances = numpy_policy.primitives(positions)

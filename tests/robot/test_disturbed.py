@@ -1,9 +1,11 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from service.base.errors import TandemError
 from service.config.world import WorldConfig
-from service.robot.backends import BackendConfig, connect, read_backend
+from service.robot.backends import Backend, BackendConfig, connect, read_backend
 from service.robot.disturbed import DisturbanceConfig, DisturbedPoses, DisturbedRobot
 from service.robot.interface import Command
 from tests.robot.fakes import HOME_M, OBJECT_M, FakeRobot
@@ -80,6 +82,29 @@ def test_a_new_start_knows_nothing_of_the_episode_before():
         robot.command(Command(home + 0.05, 0.0))
         assert moved_m(0.12) > 5e-3
         robot.command(Command(home + 0.1, 0.0))  # is still on its way when the next episode begins
+
+
+def test_a_robot_that_is_no_simulator_forgets_what_was_on_its_way_too():
+    inner = FakeRobot()
+    robot = DisturbedRobot(inner, DisturbanceConfig(command_delay_s=0.02))
+    backend = Backend(robot, inner.poses)
+    robot.command(Command(HOME_M + 0.1, 0.0))
+    backend.begin(OBJECT_M)
+    robot.wait_until(1.0)
+    assert inner.commands == []
+
+
+def test_the_robot_is_given_back_whatever_its_camera_does():
+    closed = []
+
+    def fail():
+        closed.append("camera")
+        raise OSError("gone")
+
+    backend = Backend(SimpleNamespace(close=lambda: closed.append("robot")), SimpleNamespace(close=fail))
+    with pytest.raises(OSError, match="gone"):
+        backend.close()
+    assert closed == ["robot", "camera"]
 
 
 def test_back_ends_by_name_file_and_function(tmp_path):

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from service.base.errors import TandemError
+from service.base.errors import RobotError, TandemError
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.sampling import draw_first, draw_goals, inside_gripper_or_table
@@ -48,9 +48,9 @@ def test_a_policy_of_a_users_task_plays_goals_of_the_nearest_kind(tmp_path):
     """Of what is published a robot runs no code."""
     task = Task("Mine", goals="air", closed="code of its publisher")
     policy = replace(for_robot(load("panda-cube@champion", tmp_path)), task=task)
-    bridge = SimpleNamespace(run=lambda goal_m, num_steps: 0.04)
+    bridge = SimpleNamespace(run=lambda goal_m, num_steps, truth: 0.04)
     given = {"goal_m": None, "num_episodes": 5, "num_steps": 1, "seed": 0, "ready": lambda episode, goal_m: None}
-    outcomes = list(play(bridge, SimpleNamespace(simulator=None), policy, **given))
+    outcomes = list(play(bridge, SimpleNamespace(simulator=None, begin=lambda object_m: None), policy, **given))
     assert [outcome.reached for outcome in outcomes] == [True] * 5
     assert min(outcome.goal_m[2] for outcome in outcomes) > 0.075
 
@@ -63,7 +63,7 @@ def test_a_simulators_object_starts_as_in_training(height_m, tmp_path):
     policy, begun = replace(found, config=found.config.model_copy(update={"world": world})), []
     simulator = SimpleNamespace(object_position=lambda: np.zeros(3))
     backend = SimpleNamespace(simulator=simulator, begin=begun.append)
-    bridge = SimpleNamespace(run=lambda goal_m, num_steps: 0.0)
+    bridge = SimpleNamespace(run=lambda goal_m, num_steps, truth: float(np.linalg.norm(truth() - goal_m)))
     given = {"goal_m": None, "num_episodes": 30, "num_steps": 1, "seed": 3, "ready": lambda episode, goal_m: None}
     goals = [outcome.goal_m for outcome in play(bridge, backend, policy, **given)]
     rng = np.random.default_rng(3)
@@ -79,11 +79,31 @@ def test_a_simulators_object_starts_as_in_training(height_m, tmp_path):
 
 def test_on_a_real_robot_the_other_object_stays_where_it_is_seen(tmp_path):
     policy = replace(for_robot(load("panda-two-cubes@champion", tmp_path)), task=Task("One", goals="one"))
-    seen = np.array([0.0, 0.1, 0.025, 0.05, -0.1, 0.025])
-    backend = SimpleNamespace(simulator=None, poses=SimpleNamespace(read=lambda: ObjectPose(0.0, seen)))
-    bridge = SimpleNamespace(run=lambda goal_m, num_steps: 0.0)
-    given = {"goal_m": None, "num_episodes": 20, "num_steps": 1, "seed": 0, "ready": lambda episode, goal_m: None}
+    before, seen = np.full(6, np.nan), np.array([0.0, 0.1, 0.025, 0.05, -0.1, 0.025])
+    lying = [before]
+
+    def put_back(episode, goal_m):
+        assert goal_m is None  # it is drawn from where they are put
+        lying[0] = seen
+
+    backend = SimpleNamespace(
+        simulator=None,
+        begin=lambda object_m: lying.__setitem__(0, before),
+        poses=SimpleNamespace(read=lambda: ObjectPose(0.0, lying[0])),
+    )
+    bridge = SimpleNamespace(run=lambda goal_m, num_steps, truth: 0.0)
+    given = {"goal_m": None, "num_episodes": 20, "num_steps": 1, "seed": 0, "ready": put_back}
     goals = np.array([outcome.goal_m for outcome in play(bridge, backend, policy, **given)])
     stays = (goals == seen).reshape(20, 2, 3).all(axis=2)
     assert (stays.sum(axis=1) == 1).all()
     assert stays.any(axis=0).all()
+
+
+@pytest.mark.parametrize("pose", [None, ObjectPose(0.0, np.full(6, np.nan)), ObjectPose(0.0, np.zeros(3))])
+def test_a_goal_that_depends_on_what_is_not_seen(tmp_path, pose):
+    policy = replace(for_robot(load("panda-two-cubes@champion", tmp_path)), task=Task("One", goals="one"))
+    poses = SimpleNamespace(read=lambda: pose)
+    backend = SimpleNamespace(simulator=None, begin=lambda object_m: None, poses=poses)
+    given = {"goal_m": None, "num_episodes": 1, "num_steps": 1, "seed": 0, "ready": lambda episode, goal_m: None}
+    with pytest.raises(RobotError, match="an object is not seen: put it on the table"):
+        next(play(SimpleNamespace(), backend, policy, **given))

@@ -1,6 +1,7 @@
 """Whatever policy, robot and tracker do: set-points stay within their bounds, and every fault ends in a stop."""
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -239,6 +240,27 @@ def test_least_height_and_opening_are_those_of_the_policys_robot():
 def test_a_box_with_nothing_in_it(wrong):
     with pytest.raises(ConfigError, match=r"the box x .* is empty"):
         SafetyConfig(**wrong).box(WORLD)
+
+
+def test_a_gripper_that_may_not_open_as_far_as_it_has_to():
+    with pytest.raises(
+        ConfigError, match=r"safety.min_width_m = 0.05: the gripper may open by 0.02 m at most; give less"
+    ):
+        SafeRobot(FakeRobot(), None, SafetyConfig(min_width_m=0.05, max_width_m=0.02), WorldConfig())
+
+
+def test_what_a_back_end_writes_into_later_is_not_what_was_measured():
+    robot = FakeRobot()
+    read, own = robot.read, np.zeros(3)
+
+    def in_place():
+        state = read()
+        own[:] = state.effector_m
+        return replace(state, effector_m=own)
+
+    robot.read, rows = in_place, []
+    Bridge(Steady(np.ones(4)), robot, robot.poses, WORLD, CONFIG, record=rows.append).run(OBJECT_M, 4)
+    assert np.ptp([row["effector_m"][0] for row in rows]) > 0.01
 
 
 def test_a_command_has_its_greatest_force_and_least_opening():

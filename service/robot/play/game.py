@@ -16,7 +16,7 @@ from service.config.self_play import GameConfig, SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import bob_observation, distances, each_object
 from service.envs.rules import Rules
-from service.envs.sampling import inside_fixtures
+from service.envs.sampling import inside_each_other, inside_fixtures
 from service.generator.validity import FALLEN_BELOW_M, NO_GOAL, Verdict, classify_goal, proposed
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.registry.loading import Trained
@@ -38,7 +38,7 @@ class Game:
     def __init__(self, players: Trained, seed: int = 0) -> None:
         config, on_task = players.config, players.task is not None
         rules = config.game if isinstance(config, SelfPlayConfig) else GameConfig()
-        self.world = players.world
+        self.world = players.nominal.world  # which is what the page shows
         self.take(players)
         self._alice_steps, self._num_rounds = rules.alice_steps, rules.num_goals
         self._bob_steps, self._task_steps = rules.bob_steps, players.num_steps if on_task else None
@@ -147,12 +147,12 @@ class Game:
     def set_goal(self, goal: StateArray) -> None:
         """Put goals at (3 K,) metres, or the nearest place in the workspace; Bob goes there and stays, or tries again.
 
-        Where an object would be inside a fixture there is no goal: it stays where it was.
+        Where an object would be inside a fixture or another object there is no goal: it stays where it was.
         """
         workspace = self.world.workspace
         low = [(*workspace.lower_m[:2], height) for height in self.world.rest_heights_m]
         place = np.clip(each_object(np.asarray(goal, dtype=np.float64)), low, workspace.upper_m).ravel()
-        if inside_fixtures(place[None], self.world)[0]:
+        if inside_fixtures(place[None], self.world)[0] or inside_each_other(place[None], self.world)[0]:
             return
         self.goal = place
         self.new_goals = False
@@ -201,6 +201,8 @@ class Game:
         if there:
             self.caption = "Solved" if own else f"At the goal, {100 * distance_m:.1f} cm away"
         put = self.mode == "goals" and not self.new_goals  # by hand, and so from anywhere: it may take longer
+        if there and put:
+            self._steps = 0  # where it slips away he has his time again
         solved, late = self._held >= self._hold_steps, self._steps >= self._most_steps() * (1 + put)
         if self.mode == "alice":
             if solved or late:

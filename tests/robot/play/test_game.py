@@ -56,6 +56,18 @@ def test_who_misses_the_goal_that_was_put_begins_anew(game):
     assert np.linalg.norm(game.worlds.object_position[0] - start) > 0.01  # another start
 
 
+def test_a_goal_that_was_reached_may_be_lost_and_reached_again(game):
+    """His time counts from when the object was last there."""
+    game.set_goal(np.array([0.1, 0.1, 0.2]))
+    there = game._rules.solved
+    captions = set()
+    for step in range(400):
+        game._rules.solved = (lambda goal: np.array([False])) if step in range(200, 220) else there
+        game.step()
+        captions.add(game.caption)
+    assert not any(caption.startswith("Not there") for caption in captions)
+
+
 def test_another_goal_comes_when_he_is_there(game):
     goals = set()
     for _ in range(150):
