@@ -12,7 +12,6 @@ from service.base.liveness import count_work
 from service.base.progress import doing
 from service.base.types import BoolArray, FloatArray, Metrics, StateArray
 from service.config import Config, WorldConfig
-from service.config.run import SUCCESS_DISTANCE_M
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, bob_observation, distances
 from service.envs.rules import Rules
@@ -69,11 +68,11 @@ class Evaluation:
         return asdict(self)
 
 
-def evaluated_goals(world: WorldConfig) -> tuple[GoalKind, ...]:
+def evaluated_goals(world: WorldConfig, success_distance_m: float) -> tuple[GoalKind, ...]:
     """Kinds of goals on which a run evaluates its Bob: those that its world can have."""
     if world.fixture != "none":
         return ("table",)
-    high = world.workspace.height_m > max(world.rest_heights_m) + SUCCESS_DISTANCE_M
+    high = world.workspace.height_m > max(world.rest_heights_m) + success_distance_m
     return ("table", *(("air",) if high else ()), "mixed", *(("one",) if world.num_objects > 1 else ()))
 
 

@@ -41,8 +41,8 @@ class Until:
 
     def __init__(self, minutes: float) -> None:
         self._rates: list[float] = []
-        self.is_late = False
-        """Whether the time is over."""
+        self.is_solved = self.is_late = False
+        """Whether he does; whether the time is over."""
         self._end_s = time.monotonic() + 60.0 * minutes
 
     def __call__(self, metrics: dict[str, float]) -> Ending | None:
@@ -50,7 +50,8 @@ class Until:
         if _SUCCESS in metrics:
             self._rates.append(metrics[_SUCCESS])
         newest = self._rates[-TIMES:]
-        if len(newest) == TIMES and min(newest) >= SOLVED:
+        self.is_solved = len(newest) == TIMES and min(newest) >= SOLVED
+        if self.is_solved:
             return "converged"
         self.is_late = time.monotonic() >= self._end_s
         return "finished" if self.is_late else None
@@ -90,7 +91,7 @@ def demo(
         done = train_and_tell(config, RunDirectory(path), path / "registry", resume=False, until=tell)
         solved = done.metrics.get(_SUCCESS)
         late = f"{minutes:g} minutes are over" if ends.is_late else f"It is {done.reason}"
-        why = "Bob solves four of five random goals, twice in a row" if done.reason == "converged" else late
+        why = "Bob solves four of five random goals, twice in a row" if ends.is_solved else late
         others = "" if solved is None else f" Of {config.run.final_episodes} others he solves {solved:.0%}."
         typer.echo(f"\n{why}.{others}")
         typer.echo("\nNow a task of your own, in fifteen lines: docs/own_task.md. Or look at what there is:")

@@ -206,8 +206,7 @@ def _resumed(
     configs = {}
     for name in saved:
         _, file, given = planned.get(name, ({}, *typed))
-        known = [each for each in given if not each.startswith("primitives=")]  # an alias may have moved since
-        configs[name] = resumed_config(study.config_file(name), [*known, *overrides], file)
+        configs[name] = resumed_config(study.config_file(name), [*given, *overrides], file)
     return configs
 
 
@@ -271,7 +270,7 @@ def _print(study: StudyFile, path: Path, registry: Path | None) -> None:
                 str(each.num),
                 f"{each.mean:.1%}",
                 f"{each.iqm:.1%}",
-                f"{each.low:.1%} to {each.high:.1%}",
+                f"{each.low:.1%} to {each.high:.1%}" if each.num > 1 else "-",
             ]
             for settings, each in over
         ]

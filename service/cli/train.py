@@ -270,7 +270,7 @@ def train_and_tell(
                 resume=resume, publish=publish, on_iteration=tell, runtime=runtime, start=start, options=typed,
             )  # fmt: skip
             if done.metrics:
-                final = {name.replace("evaluation/", "final/", 1): value for name, value in done.metrics.items()}
+                final = {f"final/{name.removeprefix('evaluation/')}": value for name, value in done.metrics.items()}
                 tracked.log({"env_steps": done.num_env_steps, **final})
     except InterruptError as interrupt:
         raise stopped("stopped at once", interrupt.number, hint, begun=directory.exists) from None

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from service.base.errors import TandemError, needs_extra, one_line
+from service.base.errors import ConfigError, TandemError, needs_extra, one_line
 from service.base.progress import answer, doing
 from service.methods.method import WorkersError
 from service.runs.signals import InterruptError, StopSignals
@@ -58,7 +58,7 @@ def parse_status(text: str | None, token: str | None) -> StatusOptions | None:
     """Parse ``HOST:PORT`` or ``off``; None is this machine alone, at the usual port or the next free one.
 
     Raises:
-        WorkersError: neither.
+        ConfigError: neither.
     """
     if text is None:
         return StatusOptions(token=token)
@@ -66,7 +66,7 @@ def parse_status(text: str | None, token: str | None) -> StatusOptions | None:
         return None
     host, separator, port = text.rpartition(":")
     if not separator or not host or not port.isdecimal() or len(port) > 5 or int(port) > 65535:
-        raise WorkersError(f"--status {text!r}: expected HOST:PORT, such as 127.0.0.1:8321, or off")
+        raise ConfigError(f"--status {text!r}: expected HOST:PORT, such as 127.0.0.1:8321, or off")
     return StatusOptions(host.strip("[]"), int(port), token)
 
 
@@ -168,7 +168,7 @@ def _check_reachable(address: str | None) -> None:
     if not separator:
         return
     if not port.isdecimal():
-        raise WorkersError(f"--address {address}: expected auto or HOST:PORT, as ray start prints it")
+        raise ConfigError(f"--address {address}: expected auto or HOST:PORT, as ray start prints it")
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S).close()
     except (OSError, OverflowError) as error:

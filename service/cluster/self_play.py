@@ -147,7 +147,8 @@ class RaySelfPlay(SelfPlay):
     def evaluate(self) -> Metrics:
         """Ask actors for one kind of goals each; the success is in the metrics of a later iteration."""
         alive = [slot for slot in self._pool if slot.alive]
-        for index, kind in enumerate(evaluated_goals(self.config.world) if alive else ()):
+        kinds = evaluated_goals(self.config.world, self.config.success_distance_m)
+        for index, kind in enumerate(kinds if alive else ()):
             alive[index % len(alive)].start_evaluation(self._weights, kind)
         return {}
 

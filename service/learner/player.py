@@ -38,16 +38,22 @@ class Player:
 
     def state(self) -> Arrays:
         """Copy everything that changes: parameters, Adam's state, learning rate."""
-        return copied(self.tensors()) | {"learning_rate": np.array(self.optimizer.learning_rate)}
+        rates = {"learning_rate": self.optimizer.learning_rate, "configured_rate": self.config.learning_rate}
+        return copied(self.tensors()) | {name: np.array(rate) for name, rate in rates.items()}
 
     def load_state(self, state: Mapping[str, Array]) -> None:
         """Continue exactly where ``state`` was taken, by a player of the same configuration.
 
-        Where a lower or higher learning rate is configured by now, the saved one is moved within its bounds.
+        Where another learning rate is configured by now, the saved one, which has followed the KL divergence, changes
+        in the same proportion.
         """
         put_back(state, self.tensors())
-        low, high = (self.config.learning_rate * bound for bound in LEARNING_RATE_BOUNDS)
-        self.optimizer.learning_rate = min(max(float(state["learning_rate"]), low), high)
+        now = self.config.learning_rate
+        rate = float(state["learning_rate"])
+        if (before := float(state.get("configured_rate", now))) != now:  # checkpoints of before do not say
+            rate *= now / before
+        low, high = (now * bound for bound in LEARNING_RATE_BOUNDS)
+        self.optimizer.learning_rate = min(max(rate, low), high)
 
     def tensors(self) -> dict[str, Tensor]:
         """Parameters and Adam's state by name: the tensors themselves, always in the same order."""

@@ -46,6 +46,7 @@ class Distillation(Method):
 
     def __init__(self, config: DistillingConfig, start_from: Trained | None = None) -> None:
         super().__init__()
+        torch.set_num_threads(1)  # updates are small; ``run.num_threads`` are for the worlds
         self._config, self._start_from = config, start_from
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(config.seed)
@@ -95,7 +96,7 @@ class Distillation(Method):
         return success_metrics(
             numpy_bob(self.parameters()),
             self._config,
-            evaluated_goals(self._config.world),
+            evaluated_goals(self._config.world, self._config.success_distance_m),
             run.evaluation_episodes,
             seed=EVALUATION_SEED,
             num_threads=run.num_threads,

@@ -142,7 +142,7 @@ class LocalSelfPlay(SelfPlay):
 
     def evaluate(self) -> Metrics:
         """Success of the Bob who played the last round on the run's goals, without noise."""
-        return self._actor.evaluate(self._played, evaluated_goals(self.config.world))
+        return self._actor.evaluate(self._played, evaluated_goals(self.config.world, self.config.success_distance_m))
 
     def parameters(self) -> Parameters:
         """The newest Bob, as he is evaluated and published."""

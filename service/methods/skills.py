@@ -42,6 +42,7 @@ class SkillDiscovery(Method):
 
     def __init__(self, config: SkillDiscoveryConfig) -> None:
         super().__init__()
+        torch.set_num_threads(1)  # updates are small; ``run.num_threads`` are for the worlds
         self._config, self._skills = config, config.skills
         self._loop, self._worlds, self._batches = make_skill_loop(config)
         self._cells = GoalCells(config.world)
@@ -132,6 +133,9 @@ def begin(config: SkillDiscoveryConfig, registry: Path | str, start_from: Traine
     tree, code = config.model_dump(mode="json"), recorded(config.skills.method, config.code)
     found = check_reward(config.skills, code)
     said = {"prior": found.prior, "zero_shot": found.zero_shot}
+    for key, value in said.items():
+        if key in config.skills.model_fields_set and (asked := getattr(config.skills, key)) != value:
+            raise ConfigError(f"skills.{key} = {asked!r}: {config.skills.method} says {value!r}; leave it out")
     exact = parse_config({**tree, "code": code, "skills": {**tree["skills"], **said}}, where=config.skills.method)
     assert isinstance(exact, SkillDiscoveryConfig)
     return exact

@@ -39,7 +39,7 @@ def measure_bob(config: Config, parameters: Parameters) -> dict[str, float]:
         found = success_metrics(
             numpy_bob(parameters),
             world,
-            evaluated_goals(config.world),
+            evaluated_goals(config.world, config.success_distance_m),
             config.run.final_episodes,
             seed=REPORTED_SEED,
             num_threads=config.run.num_threads,

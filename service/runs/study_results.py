@@ -25,8 +25,9 @@ SELECTION_EPISODES = 1000
 """A success of 95 % is then known to 1.4 points either way."""
 SELECTED, DISTANCE = "selection_success_last", "selection_mean_distance_m"
 """Results on the goals that choose."""
-MEASURES = ("success_last", "mixed_success_last", "coverage")
-"""Results that a table is of: the first that its runs have. Of tasks, of primitives, of skills."""
+MEASURES = ("success_last", "mixed_success_last", "table_success_last", "coverage")
+"""Results that a table is of: the first that its runs have. Of tasks, of primitives, of those beside a fixture, of
+skills."""
 NUM_RESAMPLES = 10_000
 
 

@@ -15,7 +15,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from service.base.errors import TandemError
+from service.base.errors import ConfigError, TandemError
 from service.base.files import last_lines, open_to_append, os_errors, write_atomic
 from service.base.lock import is_locked
 from service.config import Config
@@ -85,7 +85,9 @@ class Job:
         found = found.now(status.state, status.last_error if status.state == "failed" else None)
         if found.state != "failed" and found.has_more(self.total_env_steps):
             return found.now("interrupted")
-        result = place.read_result() or {"evaluation": {}, "wall_s": found.wall_s}
+        result = place.read_result()
+        if result is None or result["env_steps"] != status.num_env_steps:  # or of a shorter budget, before it failed
+            result = {"evaluation": {}, "wall_s": found.wall_s}
         return found.model_copy(update={"result": result["evaluation"], "wall_s": result["wall_s"]})
 
     def arguments(self) -> list[str]:
@@ -181,6 +183,9 @@ def share(configs: Sequence[Config], place: Place, parallel: int | None) -> tupl
     least = max(each.run.num_threads or (1 if alone else 2) for each, alone in zip(configs, one, strict=True))
     num_parallel = min(len(configs), parallel or max(1, place.num_cores // least))
     fair = max(1, min(place.num_cores // num_parallel, place.most_cores or place.num_cores))
-    return num_parallel, [
-        each.run.num_threads or (1 if alone else fair) for each, alone in zip(configs, one, strict=True)
-    ]
+    cores = [each.run.num_threads or (1 if alone else fair) for each, alone in zip(configs, one, strict=True)]
+    if place.most_cores is not None and max(cores) > place.most_cores:  # Ray would wait for such a machine for ever
+        raise ConfigError(
+            f"run.num_threads = {max(cores)}, and the largest machine has {place.most_cores} cores: give no more"
+        )
+    return num_parallel, cores

@@ -309,6 +309,8 @@ def publish_learned(
     """
     directory = RunDirectory(path)
     config = directory.read_config()
+    if not config.publishable:
+        raise TandemError(f"{path} has a Bob without primitives (policy.monolithic_bob): there is nothing to publish")
     changed = {"name": check_name(name or config.name)}
     directory.claim(resume=True)
     with closing(directory):

@@ -224,7 +224,9 @@ def test_as_dict_is_json():
 
 
 def test_goals_that_a_world_cannot_have_are_not_asked_for():
-    assert evaluated_goals(WorldConfig()) == ("table", "air", "mixed")
-    assert evaluated_goals(WorldConfig(fixture="wall")) == ("table",)
-    assert evaluated_goals(WorldConfig(workspace={"height_m": 0.06})) == ("table", "mixed")
-    assert evaluated_goals(WorldConfig(objects=("cube", "cube"))) == ("table", "air", "mixed", "one")
+    assert evaluated_goals(WorldConfig(), 0.05) == ("table", "air", "mixed")
+    assert evaluated_goals(WorldConfig(fixture="wall"), 0.05) == ("table",)
+    assert evaluated_goals(WorldConfig(workspace={"height_m": 0.06}), 0.05) == ("table", "mixed")
+    assert evaluated_goals(WorldConfig(workspace={"height_m": 0.1}), 0.05) == ("table", "air", "mixed")
+    assert evaluated_goals(WorldConfig(workspace={"height_m": 0.1}), 0.08) == ("table", "mixed")
+    assert evaluated_goals(WorldConfig(objects=("cube", "cube")), 0.05) == ("table", "air", "mixed", "one")

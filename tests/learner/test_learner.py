@@ -187,11 +187,27 @@ def test_names_in_a_state_are_those_of_checkpoints_that_are_out_there():
     learner = Learner(make_config())
     updated(learner, 0)
     parts = {"/".join(name.split("/")[:2]) for name in learner.state()}
-    of_player = "adam", "learning_rate", "policy", "value"
+    of_player = "adam", "configured_rate", "learning_rate", "policy", "value"
     players = {f"{player}/{part}" for player in ("alice", "bob") for part in of_player}
     kept = {f"demonstrations/{name}" for name in ("action", "num_steps", "observation")}
     average = {f"bob_ema/{name}" for name in learner.weights().bob}
     assert parts == players | kept | average | {"version", "rng", "counted"}
+
+
+@pytest.mark.parametrize(("adapted", "expected"), [(1.2e-4, 6e-5), (5.9e-4, 2.95e-4), (9e-6, 4.5e-6)])
+def test_half_of_the_learning_rate_is_half_of_the_one_that_was_adapted(adapted, expected):
+    """From 3e-4 to 1.5e-4; bounds are 0.03 and 2 times the new one."""
+    config = make_config()
+    learner = Learner(config)
+    learner._bob.optimizer.learning_rate = adapted
+    half = config.learner.bob.model_copy(update={"learning_rate": 0.5 * config.learner.bob.learning_rate})
+    lower = Learner(config.model_copy(update={"learner": config.learner.model_copy(update={"bob": half})}))
+    lower.load_state(learner.state())
+    assert lower._bob.optimizer.learning_rate == pytest.approx(expected)
+    assert lower._alice.optimizer.learning_rate == learner._alice.optimizer.learning_rate
+    before = {name: each for name, each in learner.state().items() if not name.endswith("configured_rate")}
+    lower.load_state(before)  # of before this was saved
+    assert lower._bob.optimizer.learning_rate == pytest.approx(min(adapted, 3e-4))
 
 
 def test_a_state_is_a_copy():

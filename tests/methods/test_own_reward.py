@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.base.errors import TandemError
+from service.base.errors import ConfigError, TandemError
 from service.config import load_config
 from service.registry.loading import load
 from service.registry.publishing import publish
@@ -104,6 +104,12 @@ def test_what_is_wrong_is_said_before_anything_is_learned(file, tmp_path, old, n
     with pytest.raises(TandemError) as error:
         load_config(None, SMALL).begin(tmp_path, None)
     assert_one_line(error.value, said)
+
+
+def test_what_the_class_says_is_not_chosen(file):
+    config = load_config(None, ["method=skills", f"skills.method={file.name}", "skills.prior=normal"])
+    with pytest.raises(ConfigError, match=r"skills.prior = 'normal': upwards.py says 'sphere'; leave it out"):
+        config.begin("no registry here", None)
 
 
 def test_a_prior_of_ours_is_not_chosen(file):

@@ -46,6 +46,7 @@ from service.store.checkpoints import CheckpointStore
 from service.store.disk_reader import DiskReader
 from service.store.run_directory import RunDirectory
 from service.store.run_log import read_log
+from service.store.run_writer import RunWriter
 from tests.cli import typed
 from tests.runs.runs import (
     ROOT,
@@ -58,7 +59,7 @@ from tests.runs.runs import (
     tiny_config,
     write_yaml,
 )
-from tests.store.stores import wait_until
+from tests.store.stores import a_status, wait_until
 
 tandem = partial(typed.tandem, PYTHONPATH=str(ROOT), MUJOCO_GL="off")
 
@@ -168,6 +169,23 @@ def test_cores_are_shared_out():
 
 def tiny_task(**run):
     return load_config(None, ["task=push", "method=ours", *(f"run.{key}={value}" for key, value in run.items())])
+
+
+def test_more_cores_than_the_largest_machine_has_are_refused():
+    config = tiny_config(num_threads=8)
+    with pytest.raises(ConfigError, match=r"run.num_threads = 8, and the largest machine has 4 cores: give no more"):
+        share([config], Place(8, 4), None)
+
+
+def test_a_run_that_failed_beyond_its_result_has_none(tmp_path):
+    play(tmp_path / "run")
+    directory = RunDirectory(tmp_path / "run")
+    status = a_status("run", state="failed", num_env_steps=200, last_error="it diverged")
+    job = Job(tmp_path / "run", "", 400, StudyRun(settings={}))
+    for env_steps, kept in ((100, {}), (200, {"mixed_success_last": 0.9})):
+        directory.write_result({"evaluation": {"mixed_success_last": 0.9}, "env_steps": env_steps, "wall_s": 1.0})
+        RunWriter(directory).status(status)
+        assert (job.left().state, job.left().result) == ("failed", kept)
 
 
 def test_what_a_run_is_told(tmp_path):
