@@ -180,6 +180,7 @@ def test_demo_is_a_short_pretraining_with_a_registry_of_its_own(asked):
     ("reason", "minutes", "said"),
     [
         ("converged", "0.5", "Bob solves four of five random goals, twice in a row"),
+        ("converged", "0.5", "It is converged"),  # by the task generator's criterion
         ("finished", "0.5", "It is finished"),
         ("finished", "0", "0 minutes are over"),
     ],
@@ -188,7 +189,9 @@ def test_demo_ends_with_why_and_what_to_type(monkeypatch, tmp_path, reason, minu
     from service.runs.train import Finished
 
     def pretrain(*args, on_iteration, **kwargs):
-        on_iteration({"env_steps": 7.0, "iteration": 1.0})
+        rate = 0.84 if "twice" in said else 0.79
+        for _ in range(2):
+            on_iteration({"env_steps": 7.0, "iteration": 1.0, "evaluation/mixed_success_last": rate})
         return Finished(reason, 1, 7, "total 1 s", {}, None, {"evaluation/mixed_success_last": 0.84})
 
     monkeypatch.setattr("service.runs.train.train", pretrain)
