@@ -68,8 +68,8 @@ class MujocoRobot:
         self._fit(given)
         self._data = mujoco.MjData(self.model)
         self._stopped = False
-        self._last: tuple[float, StateArray | None] = (0.0, None)
-        """When the joints got their last set-points, and which, before they were moved on."""
+        self._last: tuple[float, StateArray | None, StateArray] = (0.0, None, np.zeros(()))
+        """When the joints got their last set-points, which, before they were moved on, and how fast these moved."""
         self._grip = self.model.actuator_forcerange[self._fingers].copy()
         self.reset(self._places(self._start).ravel())
 
@@ -112,11 +112,11 @@ class MujocoRobot:
 
     def _led(self, solution: StateArray) -> StateArray:
         """Joint set-points moved on by what the servos lag behind at the speed of the set-points."""
-        now_s, (before_s, before) = self.now_s(), self._last
-        self._last = (now_s, solution)
-        if before is None or now_s <= before_s:
-            return solution
-        led: StateArray = solution + self._lead_s * (solution - before) / (now_s - before_s)
+        now_s, (before_s, before, speed) = self.now_s(), self._last
+        if before is not None and now_s > before_s:  # a set-point may come before the physics made a step
+            speed = (solution - before) / (now_s - before_s)
+        self._last = (now_s, solution, speed)
+        led: StateArray = solution + self._lead_s * speed
         return led
 
     def wait_until(self, time_s: float) -> None:
@@ -148,7 +148,7 @@ class MujocoRobot:
         places[:, :2], places[:, 2] = each_object(object_m)[:, :2], self.world.rest_heights_m
         mujoco.mj_setState(self.model, self._data, state[layout.physics], mujoco.mjtState.mjSTATE_FULLPHYSICS)
         self._data.time, self._stopped = now_s, False
-        self._last = (now_s, None)
+        self._last = (now_s, None, np.zeros(()))
         self._data.qacc_warmstart[:] = 0.0
         num = self._fingers.stop
         self._data.ctrl[:num] = self._data.qpos[:num]

@@ -78,6 +78,20 @@ def test_the_champion_reaches_goals_within_the_bounds_of_a_franka(champion):
     assert tip[:, 2].min() < 0.03  # it went down to the object
 
 
+def test_a_set_point_before_the_physics_made_a_step_keeps_its_lead():
+    """Of 4 ms ticks and 5 ms physics one in five comes at the time of the one before."""
+    world = WorldConfig(physics_step_s=0.005, num_substeps=8)
+    robot, sent = MujocoRobot(world, MujocoParameters(feed_forward=1.0)), []
+    here, begun_s = robot.read().effector_m, robot.now_s()
+    for tick in range(1, 16):
+        robot.command(Command(here + 0.001 * tick * np.array([0.0, 1.0, 0.0]), 0.0))
+        sent.append((robot.now_s(), robot._data.ctrl[0]))
+        robot.wait_until(begun_s + 0.004 * tick)
+    times, joints = np.array(sent[5:]).T
+    assert (np.diff(times) == 0.0).any()
+    assert np.ptp(np.diff(joints)) < 0.01
+
+
 CALIBRATION = Calibration(
     robot="mine",
     arm="panda",
