@@ -42,7 +42,7 @@ _PATH_ERRORS = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errn
 CHAMPION = "panda-cube@champion"
 """The primitives that come with the package."""
 EXIT_SIGNAL = 128
-"""Plus the signal's number: 130 for SIGINT, 143 for SIGTERM."""
+"""Plus the signal's number: 130 for SIGINT, 143 for SIGTERM, 129 for SIGHUP."""
 
 
 def _of_this_machine(value: Path) -> Path:

@@ -48,7 +48,7 @@ def named(what: str | None, method: str | None, primitives: str | None) -> tuple
     if primitives is not None:
         raise TandemError("--primitives is for learning a task: name one, such as push; a run begins from --from")
     if what is None:
-        # learned by self-play is what is learned without a word
+        # the default recipe is the one of self-play
         recipe = recipes().get(DEFAULT_RECIPE if method == "self-play" else f"{DEFAULT_RECIPE}-{method}")
         if recipe is None and method in TASK_METHODS:
             raise TandemError(f"--method {method} is for a task: name one, such as tandem train push")

@@ -42,7 +42,7 @@ class Until:
     def __init__(self, minutes: float) -> None:
         self._rates: list[float] = []
         self.is_solved = self.is_late = False
-        """Whether he does; whether the time is over."""
+        """Whether Bob solves enough; whether the time is over."""
         self._end_s = time.monotonic() + 60.0 * minutes
 
     def __call__(self, metrics: dict[str, float]) -> Ending | None:

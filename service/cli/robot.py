@@ -13,7 +13,7 @@ import numpy as np
 import typer
 from pydantic import ValidationError
 
-from service.base.errors import TandemError, in_metres
+from service.base.errors import RobotError, TandemError, in_metres
 from service.base.files import check_place
 from service.base.jsonl import JsonlWriter
 from service.base.types import StateArray
@@ -23,7 +23,7 @@ from service.config.load import explained
 from service.config.tree import apply_override
 from service.config.world import WorldConfig
 from service.envs.observations import each_object
-from service.runs.signals import StopSignals
+from service.runs.signals import InterruptError, StopSignals
 
 if TYPE_CHECKING:
     from service.registry.loading import Trained
@@ -121,6 +121,7 @@ def run(
             num_steps=steps or player.num_steps,
             seed=seed,
             ready=ready,
+            tell=lambda episode, goal_m: typer.echo(f"goal {episode + 1}: {in_metres(goal_m)}", err=True),
         )
         for outcome in _logged(played, written, lambda: bridge.safe.stopped):
             outcomes.append(outcome)
@@ -257,7 +258,12 @@ def _connected(
             return signals.first is None and (key or always_held)()
 
         with naming_errors(described):
-            yield backend, held, wait
+            try:
+                yield backend, held, wait
+            except RobotError:
+                if signals.first is not None:
+                    raise InterruptError(signals.first) from None
+                raise
 
 
 def _print_step(row: dict[str, Any], box: Box, *, to_stderr: bool) -> None:

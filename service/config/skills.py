@@ -132,16 +132,6 @@ class SkillDiscoveryConfig(Config):
         return self
 
     @model_validator(mode="after")
-    def _something_is_learned(self) -> Self:
-        starts = self.skills.sac.learning_starts
-        if self.run.total_env_steps <= starts:
-            raise ValueError(
-                f"run.total_env_steps = {self.run.total_env_steps}, and learning begins after {starts} env steps: "
-                "raise it, or lower skills.sac.learning_starts"
-            )
-        return self
-
-    @model_validator(mode="after")
     def _they_see_the_papers_positions(self) -> Self:
         if self.world.observed != ObservedConfig():
             raise ValueError("skill discovery sees the positions of the paper only: leave out world.observed")

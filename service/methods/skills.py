@@ -128,6 +128,11 @@ def begin(config: SkillDiscoveryConfig, registry: Path | str, start_from: Traine
     """
     if start_from is not None:
         raise ConfigError("--from is for self-play; skill discovery begins anew: leave it out")
+    if (steps := config.run.total_env_steps) <= (starts := config.skills.sac.learning_starts):
+        raise ConfigError(
+            f"run.total_env_steps = {steps}, and learning begins after {starts} env steps: raise it, or lower "
+            "skills.sac.learning_starts"
+        )
     if config.skills.method in SKILLS_OF:
         return config
     tree, code = config.model_dump(mode="json"), recorded(config.skills.method, config.code)

@@ -27,7 +27,7 @@ from service.policies.parameters import (
     shape_of,
 )
 
-_SMALLEST = float(np.finfo(np.float32).tiny)
+_SMALLEST, _GREATEST = 1e-30, 1e30
 _HALF_LOG_TWO_PI = np.float32(0.5 * math.log(2.0 * math.pi))
 
 
@@ -127,14 +127,15 @@ class NumpyMCPPolicy(NumpyPolicy):
         """Mean and std, (..., A) each, of the primitives at (..., P) positions under given (..., K) weights.
 
         Raises:
-            PolicyError: the last axis is not P, or not K; a weight that is below 0 or not finite, or all of a row 0.
+            PolicyError: the last axis is not P, or not K; a weight that is not from 0 to 1e30, or all of a row 0.
         """
         weights = np.asarray(weights, dtype=np.float32)
         if weights.shape[-1:] != (self.num_primitives,):
             raise PolicyError(f"weights: expected shape (..., {self.num_primitives}), got {weights.shape}")
         greatest = weights.max(axis=-1, initial=0.0)
-        if not (np.isfinite(weights).all() and weights.min(initial=0.0) >= 0.0 and (greatest >= _SMALLEST).all()):
-            raise PolicyError("weights: give finite numbers of at least 0, and in each row one above 0")
+        usual = (greatest >= _SMALLEST).all() and (greatest <= _GREATEST).all()  # or float32 is left; NaN is not usual
+        if not (usual and weights.min(initial=0.0) >= 0.0):
+            raise PolicyError("weights: give numbers from 0 to 1e30, and in each row one above 1e-30")
         return self.composed(positions, weights)
 
     def distribution(self, observation: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -100,7 +100,7 @@ def calibrate(
     """
     from service.robot.mujoco_robot import MujocoRobot
 
-    empty = world.model_copy(update={"fixture": "none", "fixtures": ()})  # as the robot's table is now
+    empty = world.model_copy(update={"fixture": "none", "fixtures": ()})  # people have cleared a real table
     wanted, _ = measure_response(MujocoRobot(empty), world, _AS_IN_TRAINING)
     full = config.model_copy(update={"pace": 1.0})
     found, delay_steps = measure_response(robot, world, full, held=held)

@@ -1,6 +1,7 @@
 """Goals of a robot, one after another: which policies play them, where they are, what came of them, and the log of it.
 
-A log is JSON lines: the first says what was run, each of the others what happened in a control step.
+A log is JSON lines. The first says what was run. Then there is a line for each control step, one for what came of a
+goal, and one for why the robot was stopped.
 """
 
 from __future__ import annotations
@@ -71,6 +72,7 @@ def play(
     num_steps: int,
     seed: int,
     ready: Callable[[int, StateArray | None], None],
+    tell: Callable[[int, StateArray], None] = lambda episode, goal_m: None,
 ) -> Iterator[Outcome]:
     """Play goals; a simulator starts each with its objects anywhere, as an evaluation does.
 
@@ -85,6 +87,7 @@ def play(
         seed: of starts and goals.
         ready: called with the episode's number and its goal, before anything moves: people put things back then. The
             goal is None where it depends on where they put them.
+        tell: called with the episode's number and such a goal, once it is known and before anything moves.
 
     Raises:
         RobotError: the robot was stopped.
@@ -102,6 +105,7 @@ def play(
         if simulator is None and goal_m is None and depends:
             ready(episode, None)
             goal = _goal_from(backend, rng, policy)
+            tell(episode, goal)
         else:
             ready(episode, goal)
         distance_m = bridge.run(goal, num_steps, truth=None if simulator is None else simulator.object_position)

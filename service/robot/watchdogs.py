@@ -10,6 +10,7 @@ import select
 import termios
 import time
 import tty
+from contextlib import suppress
 from typing import Self
 
 import numpy as np
@@ -58,7 +59,7 @@ class StateWatch:
         shapes = np.shape(state.effector_m), np.shape(state.fingers_m)
         if shapes != ((3,), (2,)):
             return (
-                f"the robot's state has an effector of the shape {shapes[0]} and fingers of {shapes[1]}: (3,) and (2,)"
+                f"in the robot's state effector_m has the shape {shapes[0]} and fingers_m {shapes[1]}: give (3,), (2,)"
             )
         if not (np.isfinite(state.effector_m).all() and np.isfinite(state.fingers_m).all()):
             return "the robot's state is not finite"
@@ -163,7 +164,8 @@ class HeldKey:
         return self
 
     def __exit__(self, *error: object) -> None:
-        termios.tcsetattr(self._descriptor, termios.TCSAFLUSH, self._settings)
+        with suppress(termios.error):  # the terminal may be gone
+            termios.tcsetattr(self._descriptor, termios.TCSAFLUSH, self._settings)
 
     def __call__(self) -> bool:
         """Whether a key is held now."""

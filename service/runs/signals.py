@@ -16,6 +16,8 @@ PASSED_ON = signal.SIGUSR1
 jobs, signals a process and those below it, and what comes twice that way must not count as a second signal."""
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, PASSED_ON)
 """The third comes where a terminal is closed or a connection drops; under ``nohup`` it is ignored, and stays so."""
+_MAY_COME_TWICE = (signal.SIGHUP, PASSED_ON)
+"""The kernel and the shell both tell of a terminal that closes: that is one stop, and not a second signal."""
 PARENT = "TANDEM_STUDY_PROCESS"
 """Variable of the environment with the id of the process above that a run of a study ends with."""
 _PR_SET_PDEATHSIG = 1
@@ -44,6 +46,7 @@ class StopSignals:
         self.first: int | None = None
         """The first signal that came."""
         self._ask: Callable[[], None] | None = None
+        self._terminals = [descriptor for descriptor in range(3) if os.isatty(descriptor)]
         before = {number: signal.getsignal(number) for number in STOPPING}
         self._previous = {number: handler for number, handler in before.items() if not _is_ignored(number, handler)}
 
@@ -72,15 +75,25 @@ class StopSignals:
             self._ask = None
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if number == PASSED_ON and self.first is not None:
+        if number in _MAY_COME_TWICE and self.first is not None:
             return
         self.first = self.first or number
+        if number == signal.SIGHUP:
+            _leave(self._terminals)
         ask = self._ask
-        if number != PASSED_ON:
+        if number not in _MAY_COME_TWICE:
             self._ask = None
         if ask is None:
             raise InterruptError(number)
         ask()
+
+
+def _leave(terminals: list[int]) -> None:
+    """Read and write nowhere in place of a terminal that is gone: each further line would be an error."""
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for descriptor in terminals:
+        os.dup2(nowhere, descriptor)
+    os.close(nowhere)
 
 
 def _is_ignored(number: int, handler: object) -> bool:

@@ -26,8 +26,8 @@ SELECTION_EPISODES = 1000
 SELECTED, DISTANCE = "selection_success_last", "selection_mean_distance_m"
 """Results on the goals that choose."""
 MEASURES = ("success_last", "mixed_success_last", "table_success_last", "coverage")
-"""Results that a table is of: the first that its runs have. Of tasks, of primitives, of those beside a fixture, of
-skills."""
+"""Results that a table is of: the first that its runs have. Tasks have the first, primitives the second or, beside a
+fixture, the third, and skills the last."""
 NUM_RESAMPLES = 10_000
 
 

@@ -117,8 +117,8 @@ def train(
 ) -> Finished:
     """Train to the end, then evaluate, publish, draw and record a video.
 
-    SIGINT and SIGTERM end the run after the current iteration, saved, and what follows it at once: a resumed run does
-    that again. A second signal ends an iteration, too. A stop request ends it as a signal does.
+    SIGINT, SIGTERM and SIGHUP end the run after the current iteration, saved, and what follows it at once: a resumed
+    run does that again. A second signal ends an iteration, too. A stop request ends it as a signal does.
 
     Args:
         config: the run.
@@ -309,6 +309,8 @@ def publish_learned(
     """
     directory = RunDirectory(path)
     config = directory.read_config()
+    if config.makes is None:
+        raise TandemError(f"{path} is a run of the method {config.method}, which makes nothing that can be published")
     if not config.publishable:
         raise TandemError(f"{path} has a Bob without primitives (policy.monolithic_bob): there is nothing to publish")
     changed = {"name": check_name(name or config.name)}

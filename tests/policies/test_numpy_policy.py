@@ -170,13 +170,14 @@ def test_inputs_of_a_wrong_size_are_refused() -> None:
         [[1, 1, 1, 1], [1, 1, 1, -1]],
         [[1, 1, 1, np.nan]] * 2,
         [[np.inf] * 4] * 2,
+        [[3e38] * 4] * 2,
         [[1e-45] * 4] * 2,
     ],
 )
 def test_weights_that_make_no_gaussian_are_refused(weights: list[list[float]]) -> None:
     numpy_policy = NumpyMCPPolicy(export_parameters(make_bob(PolicyConfig())))
     positions = np.zeros((2, 11), dtype=np.float32)
-    with pytest.raises(PolicyError, match="weights: give finite numbers of at least 0, and in each row one above 0"):
+    with pytest.raises(PolicyError, match="weights: give numbers from 0 to 1e30, and in each row one above 1e-30"):
         numpy_policy.compose(positions, np.float32(weights))
     mean, std = numpy_policy.compose(positions, np.float32([[1, 0, 0, 0]] * 2))
     means, variances = numpy_policy.primitives(positions)

@@ -83,7 +83,7 @@ def test_the_age_of_a_state(time_s, now_s, fault):
 def test_a_state_of_another_shape_is_a_fault():
     state = RobotState(1.0, np.zeros(3), np.array([0.08]))
     fault = watchdogs.StateWatch(watchdogs.WatchConfig()).check(state, 1.0)
-    assert fault == "the robot's state has an effector of the shape (3,) and fingers of (1,): (3,) and (2,)"
+    assert fault == "in the robot's state effector_m has the shape (3,) and fingers_m (1,): give (3,), (2,)"
 
 
 def test_a_state_whose_time_is_no_number_is_a_fault():

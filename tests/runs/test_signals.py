@@ -1,6 +1,7 @@
 """SIGINT and SIGTERM at any moment of a run: what is on the disk then, what is said, and the exit code."""
 
 import os
+import pty
 import signal
 from contextlib import suppress
 from types import SimpleNamespace
@@ -41,6 +42,37 @@ def test_a_signal_raises_where_nothing_else_was_asked_for(number):
         send(number)
     assert caught.value.number == signals.first == number
     assert not isinstance(caught.value, Exception)  # or a broad ``except`` would swallow it
+
+
+def test_a_terminal_that_closes_sends_one_stop_however_often_it_says_so():
+    asked, (reader, terminal) = [], pty.openpty()
+    kept = [os.dup(descriptor) for descriptor in range(3)]
+    try:
+        for descriptor in range(3):
+            os.dup2(terminal, descriptor)
+        with StopSignals() as signals, signals.asking(lambda: asked.append("stop")):
+            os.close(terminal)
+            os.close(reader)
+            for _ in range(3):
+                send(signal.SIGHUP)
+            os.write(1, b"to nobody, and no error")
+            said = list(asked)
+    finally:
+        for descriptor, before in enumerate(kept):
+            os.dup2(before, descriptor)
+            os.close(before)
+    assert (signals.first, said) == (signal.SIGHUP, ["stop"])
+
+
+def test_a_hang_up_that_is_ignored_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopSignals() as signals:
+            send(signal.SIGHUP)
+        assert signals.first is None
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 @BOTH
