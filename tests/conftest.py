@@ -74,11 +74,15 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture
 def default_signals() -> Iterator[None]:
-    """SIGINT and SIGTERM as a program in the foreground has them; a shell starts one in the background without SIGINT.
+    """Signals as a program in the foreground has them: in the background a shell takes SIGINT away, ``nohup`` SIGHUP.
 
     Processes that a test starts have them like that, too.
     """
-    defaults = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    defaults = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
     before = {number: signal.signal(number, handler) for number, handler in defaults.items()}
     yield
     for number, handler in before.items():

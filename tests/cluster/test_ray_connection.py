@@ -4,7 +4,7 @@ import pytest
 import ray
 from ray.exceptions import ActorDiedError, RayTaskError
 
-from service.base.errors import DivergedError
+from service.base.errors import DivergedError, TandemError
 from service.cluster.ray_connection import START_ATTEMPTS, connected, explaining_ray_errors
 from service.methods.method import WorkersError
 from tests.runs.runs import assert_one_line
@@ -89,7 +89,8 @@ def test_an_error_of_rays_own_is_one_line():
     ("address", "said"), [("127.0.0.1:1", "no Ray cluster answers there"), ("head:x", "HOST:PORT")]
 )
 def test_no_cluster_at_an_address_is_one_line(address, said):
-    with pytest.raises(WorkersError, match=said) as error, connected(address):
+    with pytest.raises(TandemError, match=said) as error, connected(address):
         pass
+    assert error.value.exit_code == (2 if said == "HOST:PORT" else 1)  # what was typed, or what is there
     assert "\n" not in str(error.value)
     assert address in str(error.value)

@@ -88,7 +88,7 @@ def test_from_a_run_directory_all_four_networks_are_taken(trained, tmp_path):
     observation = np.random.default_rng(0).normal(size=(4, 14)).astype(np.float32)
     published = load(str(tmp_path / "new"))
     np.testing.assert_allclose(
-        published.act_deterministic(observation),
+        published.policy.act_deterministic(observation),
         numpy_bob(new.method.learner.weights().bob).act_deterministic(observation),
     )
 
