@@ -110,7 +110,7 @@ def film(
     Raises:
         TandemError: see ``write_video``; or no goal leads what was trained.
     """
-    trained = trained.nominal  # which pictures show
+    trained = trained.nominal  # pictures show that world alone
     config = trained.config
     if isinstance(config, SkillDiscoveryConfig) and trained.kind == "skills" and trained.task is None:
         steps = config.skills.episode_steps

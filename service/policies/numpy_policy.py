@@ -28,6 +28,7 @@ from service.policies.parameters import (
 )
 
 _SMALLEST, _GREATEST = 1e-30, 1e30
+"""Of a row's greatest weight: beyond these the product of Gaussians may overflow float32."""
 _HALF_LOG_TWO_PI = np.float32(0.5 * math.log(2.0 * math.pi))
 
 
@@ -133,8 +134,8 @@ class NumpyMCPPolicy(NumpyPolicy):
         if weights.shape[-1:] != (self.num_primitives,):
             raise PolicyError(f"weights: expected shape (..., {self.num_primitives}), got {weights.shape}")
         greatest = weights.max(axis=-1, initial=0.0)
-        usual = (greatest >= _SMALLEST).all() and (greatest <= _GREATEST).all()  # or float32 is left; NaN is not usual
-        if not (usual and weights.min(initial=0.0) >= 0.0):
+        fits = (greatest >= _SMALLEST).all() and (greatest <= _GREATEST).all()  # NaN fits in neither
+        if not (fits and weights.min(initial=0.0) >= 0.0):
             raise PolicyError("weights: give numbers from 0 to 1e30, and in each row one above 1e-30")
         return self.composed(positions, weights)
 
