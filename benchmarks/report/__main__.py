@@ -37,12 +37,8 @@ PAGES = {
         "others",
         "why",
         "champion",
-        "tasks",
-        "curves",
-        "curriculum",
-        "coverage",
-        "throughput",
     ),
+    "results/pretraining-v1.md": ("tasks", "curves", "curriculum", "coverage", "throughput"),
     "results/deployed.md": ("checks",),
     "results/skills.md": ("coverage", "curves"),
     "results/comparison.md": ("rows", "longer", "below", "harder", "missing"),
@@ -126,7 +122,8 @@ class Report:
             pretraining.why_alice_words(why),
         )
         made = measured_blocks(found) | {
-            "results/pretraining.md": self.pretraining_blocks(runs, found, seeds, why),
+            "results/pretraining.md": pretraining_blocks(found, seeds, why),
+            "results/pretraining-v1.md": self.earlier_blocks(runs, found),
             "results/skills.md": self.skills_blocks(recorded_skills),
             "results/comparison.md": self.comparison_blocks(trials),
             "downstream.md": {"headline": [comparison.headline_table(trials)]},
@@ -152,8 +149,8 @@ class Report:
             self.files.append(path)
         self.files += write_results(self._results, trials)
 
-    def pretraining_blocks(self, runs: Sequence[Run], found: Results, seeds: Results, why: Results) -> Blocks:
-        """Parts of the blocks about pre-training."""
+    def earlier_blocks(self, runs: Sequence[Run], found: Results) -> Blocks:
+        """Parts of the blocks about pre-training by earlier recipes."""
         show = self.show
         counted = [run for run in runs if "curriculum" in run]  # older files have only a sample of the goals
         covered = [run for run in runs if run.get("coverage")]
@@ -171,13 +168,6 @@ class Report:
             for run in covered
         ]
         return {
-            "skill": [text(found["time_to_skill"]) for text in (recipe.recipe_words, time_to_skill.report)],
-            "seeds": [text(seeds[SEEDS]) for text in (recipe.recipe_words, pretraining.seeds_block) if SEEDS in seeds],
-            "others": [
-                pretraining.other_seeds(name, study) for name, study in seeds.items() if name not in (SEEDS, TWO)
-            ],
-            "why": [pretraining.why_alice_table(why)],
-            "champion": [pretraining.champion_words(seeds[SEEDS])],
             "tasks": [pretraining.tasks_table(runs)],
             "curves": [
                 show("Over env steps", "pretraining", figures.draw_curves, runs),
@@ -224,6 +214,17 @@ class Report:
         """Draw a picture; the line of a page that shows it."""
         self.files.append(draw(recorded, self._results / f"{name}.png"))
         return f"![{words}]({name}.png)"
+
+
+def pretraining_blocks(found: Results, seeds: Results, why: Results) -> Blocks:
+    """Parts of the blocks about pre-training by today's recipe."""
+    return {
+        "skill": [text(found["time_to_skill"]) for text in (recipe.recipe_words, time_to_skill.report)],
+        "seeds": [text(seeds[SEEDS]) for text in (recipe.recipe_words, pretraining.seeds_block) if SEEDS in seeds],
+        "others": [pretraining.other_seeds(name, study) for name, study in seeds.items() if name not in (SEEDS, TWO)],
+        "why": [pretraining.why_alice_table(why)],
+        "champion": [pretraining.champion_words(seeds[SEEDS])],
+    }
 
 
 def measured_blocks(found: Results) -> dict[str, Blocks]:
