@@ -157,7 +157,9 @@ def _registry() -> str:
     return os.environ.get("TANDEM_REGISTRY") or "registry"
 
 
-def make_env(task: str | Task | None = None, trained: Trained | None = None, *, num_envs: int = 1) -> TabletopVectorEnv:
+def make_env(
+    task: Path | str | Task | None = None, trained: Trained | None = None, *, num_envs: int = 1
+) -> TabletopVectorEnv:
     """Make a Gymnasium vector environment of N worlds of a task; ``gymnasium.make`` has single ones.
 
     Args:

@@ -50,7 +50,7 @@ class EventFile(Appender):
             StorageError: the disk is full; the event waits, see `append_bytes`.
         """
         values = [
-            Summary.Value(tag=name, simple_value=value)
+            Summary.Value(tag=name, simple_value=float(value))
             for name, value in metrics.items()
             if name not in ("iteration", "env_steps") and value is not None
         ]

@@ -255,6 +255,11 @@ def _let_touch(spec: mujoco.MjSpec, robot: RobotConfig, fingers: list[mujoco.Mjs
             slide(geom)
     for finger, description in zip(fingers, robot.fingers, strict=True):
         own = [geom for geom in finger.find_all(mujoco.mjtObj.mjOBJ_GEOM) if geom.id in solid]
+        if not (own or description.pads):
+            raise ConfigError(
+                f"robot {robot.name}: finger {description.joint!r} has no shape that touches anything: give it "
+                "pads, or let its model have collision shapes"
+            )
         for geom in [_add_pad(finger, pad) for pad in description.pads] or own:
             geom.contype = GRIPPER_BIT
             grip(geom, pad_friction)

@@ -17,6 +17,7 @@ from service.base.errors import ConfigError, TandemError
 from service.base.types import BoolArray, StateArray
 from service.config import WorkspaceConfig, WorldConfig
 from service.config.objects import FixtureConfig, ObjectConfig
+from service.config.run import SUCCESS_DISTANCE_M
 from service.envs import scene
 from service.envs.objects import GRIPPER_BIT
 from service.envs.observations import each_object
@@ -364,6 +365,12 @@ def check_goals(kind: GoalKind, config: WorldConfig) -> None:
     if config.fixture != "none" and kind != "table":
         where = {"wall": "behind it", "box": "in it"}[config.fixture]
         raise TandemError(f"goals = {kind!r} with a {config.fixture}: its goals lie {where}; choose table")
+    lowest_m = max(config.rest_heights_m) + SUCCESS_DISTANCE_M
+    if kind == "air" and lowest_m >= config.workspace.height_m:
+        raise TandemError(
+            f"goals = 'air' in a workspace {config.workspace.height_m:g} m high: they begin at {lowest_m:g} m; "
+            "choose table"
+        )
 
 
 # --- what is in the way -----------------------------------------------------------------------------------------------

@@ -63,7 +63,9 @@ class View:
 
     def of(self, worlds: BoolArray | slice) -> View:
         """Select worlds by a (N,) mask or a slice."""
-        return View(*(getattr(self, each.name)[worlds] for each in fields(self)))
+        parts = (getattr(self, each.name) for each in fields(self))
+        picked: list[Any] = [part if isinstance(part, _NotGiven) else part[worlds] for part in parts]
+        return View(*picked)
 
     def rows(self) -> FloatArray:
         """Copy the numbers but goal and memory as (N, V) float32 for a replay buffer; ``of_rows`` reads them."""

@@ -240,7 +240,10 @@ def _one_stays(goal: StateArray, start: StateArray, world: WorldConfig, rng: np.
     num = world.num_objects
     moved = rng.integers(2 * num, size=len(goal))
     # What rests on another object does not stay, either.
-    lifted = each_object(start)[:, :, 2] > np.add(world.rest_heights_m, AIR_ABOVE_REST_M / 2)
+    raised = each_object(start)[:, :, 2] - world.rest_heights_m
+    if world.randomisation.table_height_m is not None:  # the table's own height does not count
+        raised = raised - raised.min(axis=1, keepdims=True)
+    lifted = raised > AIR_ABOVE_REST_M / 2
     moved = np.where((moved < num) & lifted.any(axis=1), lifted.argmax(axis=1), moved)
     stays = (moved[:, None] < num) & (moved[:, None] != np.arange(num))
     kept = np.where(np.repeat(stays, 3, axis=1), start, goal)

@@ -16,7 +16,7 @@ from service.base.user_code import CodeError, checked, find_class, naming_errors
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
 from service.envs.observations import each_object
-from service.envs.sampling import GoalKind, check_goals, inside_each_other, sample_goals
+from service.envs.sampling import GoalKind, check_goals, inside_each_other, inside_fixtures, sample_goals
 from service.generator.validity import in_workspace
 
 NUM_DRAWN = 1024
@@ -57,7 +57,10 @@ class GoalSource(ABC):
 
     @abstractmethod
     def goals(self, known: Known, rng: np.random.Generator) -> Array:
-        """(M, K, 3) goals of all objects, metres; those outside the workspace are left out."""
+        """(M, K, 3) or (M, 3 K) goals of all objects, metres.
+
+        Those outside the workspace, or with an object inside another one or a fixture, are left out.
+        """
 
     def weights(self, known: Known, goal: StateArray, start: StateArray, learnability: StateArray) -> Array:
         """(M,) how often to draw tasks by (M, K, 3) goals and starts, and p (1 - p) of Bob's success in such tasks."""
@@ -77,13 +80,17 @@ class CheckedSource:
             self._source = kind()
 
     def goals(self, rng: np.random.Generator) -> StateArray:
-        """(M, 3 K) goals in the workspace, in which no object is inside another, metres."""
+        """(M, 3 K) goals in the workspace, in which no object is inside another one or a fixture, metres."""
         with naming_errors_of(self._origin):
             goal = np.asarray(self._source.goals(self._known, rng))
-        shape = len(np.atleast_1d(goal)), self._known.world.num_objects, 3
+        num = self._known.world.num_objects
+        if goal.ndim == 2 and goal.shape[1] == 3 * num:  # as ``known.random`` gives them
+            goal = goal.reshape(-1, num, 3)
+        shape = len(np.atleast_1d(goal)), num, 3
         goal = checked(f"{self._origin}: {self._name}.goals", goal, shape)
         kept: StateArray = goal[in_workspace(goal, self._known.world.workspace).all(axis=1)].reshape(-1, shape[1] * 3)
-        return kept[~inside_each_other(kept, self._known.world)]
+        world = self._known.world
+        return kept[~(inside_each_other(kept, world) | inside_fixtures(kept, world))]
 
     def _asked_near(self, goal: StateArray) -> BoolArray:
         """``Known.near``, of (M, 3 K) or (M, K, 3) goals."""
@@ -104,6 +111,10 @@ class CheckedSource:
         if (weight < 0.0).any():
             least = int(weight.argmin())
             raise CodeError(f"{where} gave {weight[least]:g} at [{least}]; give weights of 0 or more")
+        with np.errstate(over="ignore"):
+            total = weight.sum()
+        if not np.isfinite(total):
+            raise CodeError(f"{where} gave up to {weight.max():g}, whose sum is too large; give smaller weights")
         return weight
 
 

@@ -172,9 +172,15 @@ class Method(ABC):
         """End what it started; a second call does nothing."""
 
     def count(self, num_env_steps: int) -> dict[str, float]:
-        """Count an iteration and its env steps, and return both as metrics."""
+        """Count an iteration and its env steps, and return both as metrics.
+
+        Raises:
+            ValueError: fewer than 0.
+        """
+        if num_env_steps < 0:
+            raise ValueError(f"count of {num_env_steps} env steps; give 0 or more")
         self.iteration += 1
-        self.num_env_steps += num_env_steps
+        self.num_env_steps += int(num_env_steps)  # NumPy's cannot be saved
         return {"iteration": self.iteration, "env_steps": self.num_env_steps}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 
 from service.base.types import Array, Arrays, BoolArray, FloatArray
+from service.base.user_code import naming_errors_of, origin_of
 from service.config import WorkspaceConfig
 from service.config.skills import SkillDiscoveryConfig, SkillsConfig
 from service.envs.gym.vector import TabletopVectorEnv
@@ -116,6 +118,8 @@ class IntrinsicBatches:
 
     def __init__(self, reward: IntrinsicReward, config: SkillsConfig, see: Callable[[Columns], Seen]) -> None:
         self.reward, self._config, self._see = reward, config, see
+        origin = origin_of(type(reward))
+        self._naming_errors = nullcontext if origin is None else functools.partial(naming_errors_of, origin)
         self.losses: list[float] = []
         """Of the reward's network, since this list was last cleared."""
 
@@ -125,10 +129,13 @@ class IntrinsicBatches:
         for _ in range(self._config.gradient_steps):
             rows = replay.read(replay.draw(self._config.batch_size, rng, newest=newest))
             steps = _tensors(self._see(rows), rows["skill"], jumps=False)
-            self.losses.append(self.reward.learn(*steps))
+            with self._naming_errors():
+                self.losses.append(self.reward.learn(*steps))
         rows = replay.read(replay.draw(size, rng))
         seen = self._see(rows)
-        paid: FloatArray = self.reward.rewards(*_tensors(seen, rows["skill"], jumps=self.reward.pays_jumps)).numpy()
+        steps = _tensors(seen, rows["skill"], jumps=self.reward.pays_jumps)
+        with self._naming_errors():
+            paid: FloatArray = self.reward.rewards(*steps).numpy()
         weights = rows["skill"] if self.reward.pays_features else None
         return Batch(seen.inputs, rows["action"], paid, seen.next_inputs, weights)
 

@@ -92,6 +92,7 @@ class Run:
         with self.naming_errors():
             method = make()
         self._expect(isinstance(method, Method), "build", method, "a Method")
+        self._expect(hasattr(method, "timing"), "build", method, "one whose __init__ calls super().__init__()")
         self.method = method
         method.on_wait = self._beat
         try:
@@ -170,7 +171,7 @@ class Run:
         try:
             with self.naming_errors():
                 ended = method.step()
-            if ended is not None and self._origin is not None:
+            if ended is not None:
                 self._check(ended, before)
             if ended is not None and interval and self.iteration % interval == 0:
                 with method.timing("evaluate"), self.naming_errors():
@@ -212,7 +213,15 @@ class Run:
                 raise
 
     def _check(self, ended: object, before: int) -> None:
-        """Check an iteration of a user's method, which began at so many env steps."""
+        """Check an iteration, which began at so many env steps; all of it if the method is a user's."""
+        self._num_idle = self._num_idle + 1 if self.num_env_steps <= before else 0
+        if self._num_idle >= MAX_IDLE:
+            remedy = (
+                "say how many with self.count(NUMBER)" if self._origin else "is there a goal that Bob can be given?"
+            )
+            raise CodeError(f"{self._origin or 'the run'}: {MAX_IDLE} iterations made no env steps; {remedy}")
+        if self._origin is None:
+            return
         self._expect(isinstance(ended, Iteration), "step", ended, "an Iteration or None")
         assert isinstance(ended, Iteration)
         metrics = self.numbers("the Iteration of step", ended.metrics)
@@ -220,11 +229,6 @@ class Run:
             raise CodeError(
                 f"{self._origin}: the metrics of an Iteration lack iteration and env_steps: begin them with what "
                 "self.count(NUMBER) gives"
-            )
-        self._num_idle = self._num_idle + 1 if self.num_env_steps <= before else 0
-        if self._num_idle >= MAX_IDLE:
-            raise CodeError(
-                f"{self._origin}: {MAX_IDLE} iterations made no env steps; say how many with self.count(NUMBER)"
             )
 
     def numbers(self, verb: str, found: Metrics) -> Metrics:
@@ -298,6 +302,9 @@ class Run:
                 state = self.method.state()
             self._expect(isinstance(state, Mapping), "state", state, "arrays and plain values by name")
             arrays, values = flatten(state)
+            if self._origin is not None:
+                with self._saving("state"):
+                    check_comes_back(state)
             directory.check_owner()
             directory.sync()
             meta = {
@@ -365,6 +372,31 @@ class Run:
             raise UnsavedError(
                 f"{error}; the run is at iteration {self.iteration}, saved is iteration {saved}: --resume goes on there"
             ) from error
+
+
+def check_comes_back(state: State) -> None:
+    """Refuse what a checkpoint would give back as something else.
+
+    Raises:
+        ValueError: a component with a slash in its name, keys that are no text, or a tuple.
+    """
+    for name, part in state.items():
+        if "/" in name:
+            raise ValueError(f"{name!r} has a slash")
+        _check_plain(name, part)
+
+
+def _check_plain(name: str, part: object) -> None:
+    if isinstance(part, tuple):
+        raise ValueError(f"{name!r} has a tuple, which comes back as a list")
+    if isinstance(part, Mapping):
+        if not all(isinstance(key, str) for key in part):
+            raise ValueError(f"{name!r} has keys that are no text")
+        for each in part.values():
+            _check_plain(name, each)
+    elif isinstance(part, list):
+        for each in part:
+            _check_plain(name, each)
 
 
 def flatten(state: State) -> tuple[Arrays, dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -224,6 +225,32 @@ def test_numbers_that_no_task_has(numbers):
     assert "\n" not in str(error.value)
 
 
+def test_a_part_of_a_view_without_memory(worlds):
+    whole = Rules(Task("Mine"), worlds).view(GOAL)
+    part = View.of_rows(whole.rows(), whole.goal).of(np.array([False, True]))
+    np.testing.assert_array_equal(part.goal, whole.goal[1:])
+    with pytest.raises(LookupError, match="memory is not known"):
+        part.memory + 1
+
+
+def test_an_object_that_can_be_called_is_named_by_its_file(worlds):
+    class Paid:
+        def __call__(self, s):
+            return s.gone
+
+    with pytest.raises(CodeError, match=r"test_own_task.py:\d+: AttributeError"):
+        Rules(Task("Mine", reward=Paid()), worlds).reward(Rules(Task("Mine"), worlds).view(GOAL))
+
+
+def test_goals_in_the_air_of_a_workspace_without_room_for_them():
+    low = {"workspace": {"height_m": 0.07}}
+    with pytest.raises(TandemError, match=r"goals = 'air' in a workspace 0.07 m high: they begin at 0.075 m; choose"):
+        evaluate(
+            IdlePolicy(), Task("Low", world=low).world_from(WORLD), "air", num_episodes=1, num_steps=1,
+            success_distance_m=0.05, seed=0,
+        )  # fmt: skip
+
+
 def test_a_task_is_found_by_name_and_in_a_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text = "from service.envs.task import Task\nONE = Task('One')\nTWO = Task('Two', episode_steps=7)\n"
@@ -234,6 +261,7 @@ def test_a_task_is_found_by_name_and_in_a_file(tmp_path, monkeypatch):
     assert find_task("mine.py:TWO", {"mine.py": text}) == two
     with pytest.raises(TandemError, match=r"mine.py: it has to define one task, and has 2 of them: ONE, TWO"):
         find_task("mine.py", {"mine.py": text})
+    assert find_task(Path("mine.py:TWO"), {"mine.py": text}) == two
     with pytest.raises(TandemError, match=r"unknown task 'moon'; choose one of .*, or write FILE.py:NAME"):
         find_task("moon")
 

@@ -149,6 +149,14 @@ def test_pads_touch_instead_of_a_fingers_own_shapes(tmp_path):
         assert [geom.type[0] for geom in solid if geom.name != "robot/fixed"] == [mujoco.mjtGeom.mjGEOM_CAPSULE] * 2
 
 
+def test_a_finger_that_touches_nothing_is_refused(tmp_path):
+    before, name, after = URDF.partition('<link name="left_finger">')
+    shape, end, rest = after.partition("</link>")
+    shapeless = before + name + shape[: shape.index("<collision>")] + end + rest
+    with pytest.raises(ConfigError, match=r"finger 'left' has no shape that touches anything: give it pads"):
+        WorldBatch(world_of(write_robot(tmp_path, shapeless, URDF_DESCRIPTION)), 1)
+
+
 def test_a_description_is_part_of_the_configuration(pincher, tmp_path, monkeypatch):
     config = load_config(None, [f"world.robot={pincher}"])
     (tmp_path / "saved.yaml").write_text(dump_config(config))

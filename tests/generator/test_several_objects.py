@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from service.config import parse_config
+from service.config.world import RandomisationConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import distances
 from service.envs.sampling import are_apart
@@ -170,6 +171,17 @@ def test_what_is_held_or_lies_on_another_at_the_start_does_not_stay():
         stays = np.isclose(found, start).reshape(-1, 2, 3).all(axis=2)
         assert not stays[:, 0].any()
         assert 0.4 < stays[:, 1].mean() < 0.6
+
+
+def test_on_a_high_table_either_object_may_be_the_one_that_moves():
+    high = WORLD.model_copy(update={"randomisation": RandomisationConfig(table_height_m=(0.03, 0.05))})
+    start = np.tile([-0.1, 0.0, 0.075, 0.05, 0.0, 0.075], (2000, 1))
+    goal = np.tile([0.0, 0.1, 0.075, -0.1, -0.1, 0.075], (2000, 1))
+    stays = np.isclose(_one_stays(goal, start, high, np.random.default_rng(0)), start).reshape(-1, 2, 3).all(axis=2)
+    np.testing.assert_allclose(stays.mean(axis=0), [0.25, 0.25], atol=0.05)
+    held = np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
+    found = _one_stays(goal, start + held, high, np.random.default_rng(0))
+    assert not np.isclose(found[:, :3], (start + held)[:, :3]).all(axis=1).any()
 
 
 def test_a_goal_that_would_be_in_the_way_of_what_stays_is_as_it_was():

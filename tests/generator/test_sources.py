@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from service.base.errors import TandemError
-from service.config import load_config
+from service.config import load_config, parse_config
 from service.generator.generator import TaskGenerator
+from service.generator.sources import CheckedSource
 from service.generator.validity import Verdict
 from tests.generator.test_generator import FREE, ONE_GAME, choose, everywhere, only_starts, record
 from tests.runs.runs import assert_one_line
@@ -56,7 +57,7 @@ def test_goals_are_its_own_and_in_the_workspace(file):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("return goal[known", "return goal[:, 0][known", "corner.py: Corner.goals gave float64 of shape ("),
+        ("return goal[known", "return goal[:, :, :2][known", "corner.py: Corner.goals gave float64 of shape ("),
         (
             "[0.05, 0.05, 0.025], [0.3",
             "[1.05, 0.05, 0.025], [1.3",
@@ -65,6 +66,7 @@ def test_goals_are_its_own_and_in_the_workspace(file):
         ("goal[:, 0])]", "goal[:, None])]", "corner.py: known.near: goal has shape ("),
         ("known.near(", "known.far(", "corner.py:8: AttributeError: "),
         ("(learnability > 0.0)", "np.nan", "Corner.weights gave nan at [0] of shape ("),
+        ("(learnability > 0.0)", "1e308", "Corner.weights gave up to 1e+308, whose sum is too large; give smaller"),
         ("(learnability > 0.0)", "-learnability", "Corner.weights gave -0.25 at [0]; give weights of 0 or more"),
         ("(learnability > 0.0)", "learnability[:, None]", "Corner.weights gave float64 of shape ("),
         ("def goals", "def gaols", "corner.py: TypeError: Can't instantiate abstract class Corner"),
@@ -84,6 +86,25 @@ def test_it_cannot_change_the_goals_that_are_played(file):
     with pytest.raises(TandemError) as error:
         load_config(None, SETTINGS).begin("registry", None)
     assert_one_line(error.value, "ValueError", "read-only")
+
+
+def test_goals_as_random_gives_them(file):
+    file.write_text(CODE.replace("return goal[known.near(goal[:, 0])]", "return known.random(rng, 50)"))
+    config = load_config(None, SETTINGS).begin("registry", None)
+    assert CheckedSource(config, 0.0, 0.0, lambda goal: goal[:, 0] > 0).goals(np.random.default_rng(0)).shape == (50, 3)
+
+
+def test_no_goal_is_inside_a_fixture(file):
+    block = {"shape": "box", "size_m": [0.04, 0.04, 0.2], "position_m": [0.12, 0.075]}
+    everywhere = CODE.replace("[known.near(goal[:, 0])]", "")
+    file.write_text(everywhere)
+    config = load_config(None, SETTINGS).begin("registry", None)
+    kept = [
+        CheckedSource(each, 0.0, 0.0, lambda goal: goal[:, 0] > 0).goals(np.random.default_rng(0))
+        for each in (config, parse_config(config.model_dump() | {"world": {"fixtures": [block]}}, where="a test"))
+    ]
+    assert 0 < len(kept[1]) < len(kept[0])
+    assert kept[0][:, 0].max() > 0.12 > 0.08 > kept[1][:, 0].max()  # 2 cm of the block, 2.5 cm of the cube
 
 
 @pytest.mark.parametrize("kind", ["tabel", "one"])

@@ -131,7 +131,9 @@ def test_a_key_of_one_method_is_unknown_to_another(file, method, key, said):
             "pass",
             "mine.py: measure gave a NoneType; give metrics, numbers",
         ),
+        ("count(10)", "count(-1)", "mine.py:15: ValueError: count of -1 env steps; give 0 or more"),
         ("return Climb(self)", "return 3", "mine.py: build gave a int; give a Method"),
+        ("super().__init__()", "pass", "mine.py: build gave a Climb; give one whose __init__ calls super().__init__()"),
         ("self.count(10) | {", "{", "the metrics of an Iteration lack iteration and env_steps"),
         (
             '"climb/height": self.height',
@@ -148,6 +150,17 @@ def test_a_key_of_one_method_is_unknown_to_another(file, method, key, said):
             '"rng": object()',
             "mine.py: state gave what cannot be saved: Object of type object is not",
         ),
+        ('"rng": self', '"n/rng": self', "mine.py: state gave what cannot be saved: 'n/rng' has a slash"),
+        (
+            '"rng": self.rng.bit_generator.state',
+            '"rng": [{"n": (1, 2)}]',
+            "mine.py: state gave what cannot be saved: 'rng' has a tuple, which comes back as a list",
+        ),
+        (
+            '"rng": self.rng.bit_generator.state',
+            '"rng": {1: 2}',
+            "mine.py: state gave what cannot be saved: 'rng' has keys that are no text",
+        ),
         ("np.array([self.height])", "self.height", "mine.py: parameters, 'height', gave a float; give one of NumPy's"),
         ("np.array([self.height])", "np.array(['high'])", "mine.py: state gave what cannot be saved: "),
     ],
@@ -159,6 +172,15 @@ def test_an_error_of_the_method_names_its_line(file, tmp_path, monkeypatch, old,
     with pytest.raises(ConfigError) as error:
         train(config_of(), RunDirectory(tmp_path / "run"), tmp_path / "registry", on_iteration=ignore)
     assert_one_line(error.value, said)
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_numbers_of_numpys_count(file, tmp_path):
+    text = CODE.replace("count(10)", "count(np.int64(10))")
+    file.write_text(text.replace('"climb/height": self.height', '"climb/height": np.array(2.0)'))
+    train(config_of(), RunDirectory(tmp_path / "run"), tmp_path / "registry", on_iteration=ignore)
+    rows = read_lines(tmp_path / "run" / "metrics.jsonl")
+    assert [(row["env_steps"], row["climb/height"]) for row in rows] == [(10 * step, 2.0) for step in range(1, 7)]
 
 
 @pytest.mark.usefixtures("default_signals")

@@ -106,6 +106,19 @@ def test_what_is_wrong_is_said_before_anything_is_learned(file, tmp_path, old, n
     assert_one_line(error.value, said)
 
 
+def test_an_error_while_it_learns_names_its_line(file, tmp_path):
+    old = "return self.network(after) - self.network(before)"
+    file.write_text(CODE.replace(old, f"{old} if len(skill) < 16 else 1 / 0"))
+    with pytest.raises(ConfigError) as error:
+        train(
+            load_config(None, SMALL),
+            RunDirectory(tmp_path / "run"),
+            tmp_path / "registry",
+            on_iteration=lambda metrics: None,
+        )
+    assert_one_line(error.value, "upwards.py:13: ZeroDivisionError")
+
+
 def test_what_the_class_says_is_not_chosen(file):
     config = load_config(None, ["method=skills", f"skills.method={file.name}", "skills.prior=normal"])
     with pytest.raises(ConfigError, match=r"skills.prior = 'normal': upwards.py says 'sphere'; leave it out"):

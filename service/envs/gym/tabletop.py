@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -60,7 +61,7 @@ class GoalWorlds:
         num_worlds: int,
         num_threads: int,
         config: WorldConfig | None,
-        task: str | Task | None,
+        task: Path | str | Task | None,
         success_distance_m: float,
     ) -> None:
         self.config = config or WorldConfig()
@@ -68,9 +69,11 @@ class GoalWorlds:
             raise TandemError(
                 f"config is a {type(config).__name__}: give a WorldConfig, such as load(...).config.world, or None"
             )
-        asked = find_task(task) if isinstance(task, str) else task
+        asked = find_task(task) if isinstance(task, str | Path) else task
         if asked is None:
             asked = Task("Tabletop", goals=self.config.usual_goals)
+        if not isinstance(asked, Task):
+            raise TandemError(f"task is a {type(asked).__name__}: give a name, a file, a Task, or None")
         self.config = asked.world_from(self.config)
         if not success_distance_m > 0.0:
             raise TandemError(f"success_distance_m = {success_distance_m}; give a distance above 0 m")
@@ -164,6 +167,8 @@ class GoalWorlds:
         except (TypeError, ValueError):
             raise TandemError(f"reset: options['goal'] = {options['goal']!r}: give numbers, metres") from None
         num, size = self._worlds.num_worlds, self._goal.shape[1]
+        if goal.shape[-2:] == (size // 3, 3):  # as tasks write the goals of several objects
+            goal = goal.reshape(*goal.shape[:-2], size)
         if goal.shape not in ((size,), (num, size)):
             raise TandemError(
                 f"reset: options['goal'] has shape {goal.shape}, not {(size,)} or {(num, size)}: give metres"
@@ -253,7 +258,7 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
         self,
         config: WorldConfig | None = None,
         *,
-        task: str | Task | None = None,
+        task: Path | str | Task | None = None,
         success_distance_m: float = 0.05,
         render_mode: str | None = None,
         width: int = 640,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -53,7 +54,7 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         num_envs: int = 1,
         config: WorldConfig | None = None,
         *,
-        task: str | Task | None = None,
+        task: Path | str | Task | None = None,
         success_distance_m: float = 0.05,
         max_episode_steps: int | None = None,
         num_threads: int = 0,

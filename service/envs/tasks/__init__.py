@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from service.base.errors import TandemError, did_you_mean
@@ -26,7 +27,7 @@ TASKS = (*PAPERS, "hard-larger", "hard-inair", "hard-push", "hard-box")
 so their difficulty is not known, and they are left out."""
 
 
-def find_task(name: str, code: Mapping[str, str] | None = None, world: Mapping[str, Any] | None = None) -> Task:
+def find_task(name: str | Path, code: Mapping[str, str] | None = None, world: Mapping[str, Any] | None = None) -> Task:
     """Find a task by its name, or in a file of a user's.
 
     Args:
@@ -37,6 +38,7 @@ def find_task(name: str, code: Mapping[str, str] | None = None, world: Mapping[s
     Raises:
         TandemError: no such task, or a file that has none.
     """
+    name = str(name)
     if name in TASKS:
         return _our_task(name)
     if parse_reference(name) is None:
