@@ -174,11 +174,18 @@ def loading() -> AbstractContextManager[Activity]:
 
 
 class Terminal(Console):
-    """A terminal, or what is in its place, that may go away: then a command goes on without a word."""
+    """A terminal, or what is in its place, that may go away or be full: then a command goes on without a word."""
 
     def on_broken_pipe(self) -> None:
         """Say nothing more; rich would end the process."""
         self.quiet = True
+
+    def _check_buffer(self) -> None:
+        """Leave out what cannot be written, as on a full disk or a terminal that is gone; rich would raise."""
+        try:
+            super()._check_buffer()
+        except OSError:
+            del self._buffer[:]
 
 
 class CommandGroup(TyperGroup):

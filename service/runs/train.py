@@ -227,7 +227,8 @@ def _end_now(report: Report, directory: RunDirectory, what: str) -> None:
     try:
         saved = next(reversed(CheckpointStore(directory.checkpoints).steps()), None)
         text = f"{what}; " + ("nothing is saved yet" if saved is None else f"--resume goes on from iteration {saved}")
-        print(f"error: {text}", file=sys.stderr, flush=True)
+        with suppress(OSError):  # a full disk, or a terminal that is gone
+            print(f"error: {text}", file=sys.stderr, flush=True)
         ending = Thread(target=report.__exit__, args=(WorkersError, WorkersError(text), None), daemon=True)
         ending.start()
         ending.join(END_S)  # a disk or a Redis may stand still, too

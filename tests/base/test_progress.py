@@ -1,5 +1,6 @@
 """Progress of what takes long: when it is shown, what it says, and that nothing is left of it."""
 
+import errno
 import io
 import re
 import threading
@@ -128,14 +129,35 @@ def test_a_terminal_is_left_as_if_there_had_been_nothing(clock):
         assert screen(shown) == ["a line"]
 
 
-def test_a_terminal_that_is_gone_ends_nothing():
+class Failing(io.StringIO):
+    """Raises at every write, as long as there is something to raise."""
+
+    def __init__(self, error):
+        super().__init__()
+        self.error = error
+
+    def write(self, text):
+        if self.error is not None:
+            raise self.error
+        return super().write(text)
+
+
+def test_a_reader_that_is_gone_ends_nothing():
     """As with ``tandem train 2>&1 | head -1``: rich would end the process."""
-
-    class Gone(io.StringIO):
-        def write(self, text):
-            raise BrokenPipeError
-
-    with Display(Terminal(file=Gone())) as display:
+    with Display(Terminal(file=Failing(BrokenPipeError()))) as display:
         display.say("a line")
         display.say("another")
     assert display.console.quiet
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])  # a full disk, a terminal that is gone
+@pytest.mark.parametrize("terminal", [False, True])
+def test_what_cannot_be_written_is_left_out_and_ends_nothing(number, terminal):
+    file = Failing(OSError(number, "cannot be written"))
+    with Display(Terminal(file=file, force_terminal=terminal, width=100)) as display:
+        with doing("learning", 10, "env steps") as task:
+            display.say("lost")
+            task.advance(1)
+        file.error = None  # somebody has made room
+        display.say("a line")
+    assert file.getvalue() == "a line\n"
