@@ -42,14 +42,14 @@ from pydantic import BaseModel, JsonValue, TypeAdapter
 from service.base.errors import TRACEBACK_PREFIX, CheckpointError, ConfigError, RunTakenError, StorageError, TandemError
 from service.base.files import Appender, os_errors, remove_temporaries, write_atomic
 from service.base.jsonl import JsonlWriter
-from service.base.lock import LOCK_FILE, DirectoryLock, claim_epoch, give_back_epoch, newest_epoch
+from service.base.lock import EPOCHS, LOCK_FILE, DirectoryLock, claim_epoch, give_back_epoch, newest_epoch
 from service.base.parsing import parse_json
 from service.base.types import FloatArray, StateArray
 from service.base.version import LEARNING_VERSION, git_commit
 from service.config import Config, dump_config, load_config
 from service.store import run_log
 from service.store.checkpoints import CheckpointStore
-from service.store.models import CONFIG_FILE, GOALS_FILE, METRICS_FILE, OUTPUT_FILE, STATUS_FILE, STUDY_FILE
+from service.store.models import CONFIG_FILE, GOALS_FILE, METRICS_FILE, OUTPUT_FILE, STATUS_FILE, STOP_FILE, STUDY_FILE
 from service.store.run_history import (
     BEFORE,
     Event,
@@ -78,6 +78,9 @@ _BEFORE_A_RUN = (
     "environment.json",
     "tensorboard",
     "checkpoints",
+    "snapshots",
+    EPOCHS,
+    STOP_FILE,
 )
 """How names begin of what may be where a run begins: one that ended before it had begun leaves it."""
 MAX_RECORDINGS = 20

@@ -1,6 +1,7 @@
 """Runs that begin from what another one learned, in worlds that draw their physics and show last commands."""
 
 import logging
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from service.registry.loading import load
 from service.registry.publishing import publish, publish_run
 from service.registry.registry import Registry
 from service.runs.train import open_run
+from service.store import run_directory
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import TREE, assert_same_run, play, tiny_config
 
@@ -47,6 +49,24 @@ def test_a_version_whose_publisher_was_cut_off_becomes_the_latest(tmp_path, monk
     assert (len(registry.versions("tiny")), registry.aliases("tiny")) == (1, {})
     published = publish_run(run.directory, registry, found.config, found.parameters, {})
     assert (len(registry.versions("tiny")), registry.aliases("tiny")) == (1, {"latest": published.number})
+
+
+def test_a_start_that_was_cut_off_can_be_tried_again(tmp_path, monkeypatch):
+    """The configuration comes last, so all else that a start writes is there."""
+
+    def cut_off(path, *_):
+        if path.name == "config.yaml":
+            raise StorageError("the disk is full")
+
+    with monkeypatch.context() as patch, closing(RunDirectory(tmp_path / "run")) as directory:
+        patch.setattr(run_directory, "write_atomic", cut_off)
+        with pytest.raises(StorageError):
+            open_run(tiny_config(), directory)
+    (tmp_path / "run" / "stop").touch()  # it was asked to stop meanwhile
+    left = {path.name for path in (tmp_path / "run").iterdir()}
+    assert {"checkpoints", "snapshots", "epochs", "tensorboard"} < left
+    _, ended = play(tmp_path / "run")
+    assert ended.reason == "finished"
 
 
 def test_a_run_with_more_to_see_is_exact_when_resumed(tmp_path):
