@@ -163,18 +163,28 @@ class Registry:
         return manifest, tensors.decode(self.get_blob(manifest.blob_sha256))
 
     def names(self) -> list[str]:
-        """Every name that has a version, sorted.
+        """Every name that has a version, sorted, without those that may not be read, as of another user.
 
         Raises:
             RegistryError: something else than a directory is at the registry's path.
         """
+        return [name for name in self._all_names() if self._has_versions(name)]
+
+    def _all_names(self) -> list[str]:
+        """Every name that has a directory, sorted."""
         if self.root.exists() and not self.root.is_dir():
             raise RegistryError(
                 f"{self.root} is no directory, as a registry is; name one with --registry or TANDEM_REGISTRY"
             )
         directory = self.root / "models"
         found = [entry.name for entry in directory.iterdir()] if directory.is_dir() else []
-        return sorted(name for name in found if names.is_name(name) and self.versions(name))
+        return sorted(filter(names.is_name, found))
+
+    def _has_versions(self, name: str) -> bool:
+        try:
+            return bool(self.versions(name))
+        except PermissionError:
+            return False
 
     def versions(self, name: str) -> list[Version]:
         """The versions of ``name``, oldest first; empty when there are none."""
@@ -221,9 +231,15 @@ class Registry:
         """
         if reference is not None:
             return self._problems_of(self.resolve(reference), check)
-        versions = [version for name in self.names() for version in self.versions(name)]
-        problems = [problem for version in versions for problem in self._problems_of(version, check)]
-        return problems + [problem for name in self.names() for problem in self._alias_problems(name)]
+        problems = list[str]()
+        for name in self._all_names():
+            try:
+                versions = self.versions(name)
+                problems += [problem for version in versions for problem in self._problems_of(version, check)]
+                problems += self._alias_problems(name) if versions else []
+            except OSError as error:
+                problems.append(f"{name}: cannot read {error.filename}: {error.strerror}; check its permissions")
+        return problems
 
     def export(self, reference: str, directory: Path) -> Manifest:
         """Write a version into ``directory``: ``primitives.safetensors`` and ``manifest.json``, which need no registry.

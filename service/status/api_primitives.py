@@ -10,7 +10,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as InPath
 
-from service.base.errors import DamagedBlobError, FormatVersionError, RegistryError
+from service.base.errors import DamagedBlobError, FormatVersionError, RegistryError, StorageError
 from service.base.parsing import NAME
 from service.registry.bundled import BUNDLED, find_version, is_bundled
 from service.registry.manifest import Manifest
@@ -130,14 +130,14 @@ class Shelf:
     def summary(self, name: str) -> PrimitiveSummary:
         """What there is of a name that has a version."""
         origins, aliases = self._origins(name), dict[str, tuple[Origin, int]]()
-        with suppress(RegistryError):  # a damaged one must not hide the other names; the name's own page says so
+        with suppress(StorageError, OSError):  # one must not hide the other names; the name's own page says so
             aliases = self._aliases(name)
         return PrimitiveSummary(
             name=name,
             num_versions=len(origins),
             newest=max(origins),
             aliases={alias: number for alias, (_, number) in sorted(aliases.items())},
-            origins=tuple(origin for origin in reversed(self.registries) if self.registries[origin].versions(name)),
+            origins=tuple(origin for origin in reversed(self.registries) if self._versions(origin, name)),
         )
 
     def versions(self, name: str, limit: int) -> tuple[VersionSummary, ...]:
@@ -152,8 +152,14 @@ class Shelf:
 
     def _origins(self, name: str) -> dict[int, Origin]:
         """Where each version is."""
-        registries = self.registries.items()
-        return {version.number: origin for origin, registry in registries for version in registry.versions(name)}
+        return {version.number: origin for origin in self.registries for version in self._versions(origin, name)}
+
+    def _versions(self, origin: Origin, name: str) -> list[Version]:
+        """The versions of a name in one of the registries; none where they may not be read, as of another user."""
+        try:
+            return self.registries[origin].versions(name)
+        except PermissionError:
+            return []
 
     def _aliases(self, name: str) -> dict[str, tuple[Origin, int]]:
         """Where the version of each alias is, and its number."""

@@ -188,15 +188,20 @@ class Telemetry(Collector):
     def _about_registry(self) -> Iterator[_Family]:
         up, versions, aliases = _REGISTRY_UP.family(), _VERSIONS.family(), _ALIAS.family()
         try:
-            for name in self._registry.names():
+            names = self._registry.names()
+        except (StorageError, OSError) as error:
+            _logger.warning("/metrics has no name of the registry: %s", error)
+            up.add_metric([], 0)
+            yield up
+            return
+        up.add_metric([], 1)
+        for name in names:
+            try:
                 versions.add_metric([name], len(self._registry.versions(name)))
                 for alias, number in self._registry.aliases(name).items():
                     aliases.add_metric([name, alias], number)
-        except (StorageError, OSError) as error:
-            _logger.warning("/metrics has not all of the registry: %s", error)
-            up.add_metric([], 0)
-        else:
-            up.add_metric([], 1)
+            except (StorageError, OSError) as error:  # must not hide the other names
+                _logger.warning("/metrics has not all of %s in the registry: %s", name, error)
         yield from (up, versions, aliases)
 
 

@@ -1,5 +1,6 @@
 """Versions are whole, unique, contiguous and unchanging; aliases move."""
 
+import errno
 import hashlib
 import json
 import os
@@ -20,6 +21,7 @@ from service.registry.manifest import parse_manifest
 from service.registry.names import Version
 from service.registry.registry import Registry
 from tests.registry.helpers import Publish, arrays_of_all_kinds, assert_identical, files_in
+from tests.runs.runs import assert_one_line
 
 
 def test_round_trip(registry: Registry, publish: Publish) -> None:
@@ -191,6 +193,27 @@ def test_verify_finds_swapped_manifests_and_dangling_or_damaged_aliases(registry
     assert "champion is damaged" in registry.verify()[1]
     registry.set_alias("panda-cube", "champion", 1)
     assert len(registry.verify()) == 1
+
+
+def test_a_name_that_may_not_be_read_hides_no_other_and_is_reported(
+    registry: Registry, publish: Publish, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish()
+    publish("private")
+    versions = registry.root / "models" / "private" / "versions"
+    is_dir = Path.is_dir
+
+    def refused(path: Path) -> bool:  # root may read everything
+        if path == versions:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return is_dir(path)
+
+    monkeypatch.setattr(Path, "is_dir", refused)
+    assert registry.names() == ["panda-cube"]
+    (problem,) = registry.verify()
+    assert_one_line(problem, f"private: cannot read {versions}: Permission denied")
+    with pytest.raises(PermissionError):  # where this name is meant
+        registry.versions("private")
 
 
 def test_another_format_version_is_named(registry: Registry, publish: Publish, tmp_path: Path) -> None:

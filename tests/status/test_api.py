@@ -159,6 +159,18 @@ def test_versions_of_a_name(client, home):
     assert len(client.get("/v1/primitives/tiny?limit=1").json()["versions"]) == 1
 
 
+def test_a_name_of_another_user_does_not_hide_the_bundled_one(registry, monkeypatch):
+    versions = Registry.versions
+
+    def refused(place, name):  # root may read everything
+        if place.root == registry.root:
+            raise PermissionError
+        return versions(place, name)
+
+    monkeypatch.setattr(Registry, "versions", refused)
+    assert Shelf(registry).summary("panda-cube").origins == ("bundled",)
+
+
 def test_a_damaged_manifest_does_not_hide_the_others(client, home):
     registry = Registry(home / "registry")
     publish(registry, "half")

@@ -136,14 +136,26 @@ def test_the_store_is_away(service):
     assert value(samples, "tandem_registry_up") == 1
 
 
-def test_a_damaged_registry(service):
+def test_a_damaged_name_hides_no_other(service, caplog):
     client, runs = service
-    aliases = runs.parent / "registry" / "models" / "tiny" / "aliases"
-    aliases.mkdir(parents=True)
-    (aliases / "latest").write_text("none")
-    (aliases.parent / "versions").mkdir()
-    (aliases.parent / "versions" / "1").write_text("{}")
-    assert value(scrape(client), "tandem_registry_up") == 0
+    for name, alias in (("damaged", "none"), ("tiny", "1")):
+        model = runs.parent / "registry" / "models" / name
+        (model / "aliases").mkdir(parents=True)
+        (model / "aliases" / "latest").write_text(alias)
+        (model / "versions").mkdir()
+        (model / "versions" / "1").write_text("{}")
+    samples = scrape(client)
+    assert value(samples, "tandem_registry_up") == 1
+    assert value(samples, "tandem_registry_alias_version", name="tiny", alias="latest") == 1
+    assert "/metrics has not all of damaged in the registry" in caplog.text
+
+
+def test_a_registry_that_cannot_be_read(service):
+    client, runs = service
+    (runs.parent / "registry").write_text("a file where a directory should be")
+    samples = scrape(client)
+    assert value(samples, "tandem_registry_up") == 0
+    assert [key for key in samples if key[0].startswith("tandem_registry_")] == [("tandem_registry_up",)]
 
 
 def test_the_number_of_series_is_bounded():
