@@ -28,8 +28,11 @@ from service.store.run_directory import RunDirectory
 GO_ON, STOP, END_NOW = range(3)
 """What a run is asked for: a stop is after its iteration, saved."""
 POLL_S = 0.2
-TAKEN_S = 60.0
-"""Time that the process of an earlier study has to end, which is told that its study is gone."""
+TAKEN_S = 150.0
+"""Time that the process of an earlier study has to end, which is told that its study is gone.
+
+An NFS server keeps the lock of a machine that is lost for a lease, of 90 s by default.
+"""
 PATIENCE_S = (1.0, 5.0, 5.0)
 """Time that a process has to end after SIGTERM, a second SIGTERM, and SIGKILL."""
 Asked = Callable[[], int]

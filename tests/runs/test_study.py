@@ -12,6 +12,7 @@ import sys
 import threading
 from contextlib import nullcontext
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -48,6 +49,7 @@ from service.store.run_directory import RunDirectory
 from service.store.run_log import read_log
 from service.store.run_writer import RunWriter
 from tests.cli import typed
+from tests.clock import Clock
 from tests.runs.runs import (
     ROOT,
     TINY_TASK,
@@ -370,6 +372,24 @@ def test_a_machine_that_has_no_process_for_a_run_fails_that_run_alone(tmp_path, 
     job = Job(tmp_path / "run", dump_config(tiny_config()), 600, StudyRun(settings={}))
     found = run_process(job, lambda: GO_ON)
     assert (found.state, os.strerror(errno.EAGAIN) in found.error) == ("failed", True)
+
+
+def test_a_run_waits_until_the_server_gives_up_the_lock_of_a_lost_machine(tmp_path, monkeypatch):
+    clock, begun_s = Clock(), []
+    freed_s = clock.now_s + 95.0  # a lease of NFSv4 has 90 s
+
+    def sleep(seconds):
+        clock.now_s += seconds
+
+    def begin(*_, **__):
+        begun_s.append(clock.now_s)
+        raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    monkeypatch.setattr(study_run, "time", SimpleNamespace(monotonic=clock, sleep=sleep))
+    monkeypatch.setattr(study_run, "is_locked", lambda _: clock.now_s < freed_s)
+    monkeypatch.setattr(subprocess, "Popen", begin)
+    run_process(Job(tmp_path / "run", dump_config(tiny_config()), 600, StudyRun(settings={})), lambda: GO_ON)
+    assert begun_s == [pytest.approx(freed_s, abs=1.0)]
 
 
 # --- a whole one -----------------------------------------------------------------------------------------------------
