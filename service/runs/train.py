@@ -30,7 +30,7 @@ from service.media.artifacts import make_artifacts
 from service.methods.method import Method, StateLostError, WorkersError
 from service.methods.task_evaluation import FINAL_SEED, evaluate_on, numbers_of
 from service.registry.loading import Trained, load
-from service.registry.names import Version, check_name
+from service.registry.names import Version, check_name, is_service
 from service.registry.publishing import check_publishable, measure_bob, measure_skills, publish_run
 from service.registry.registry import Registry
 from service.runs.report import Report
@@ -157,7 +157,8 @@ def train(
         begins = "goes on with" if resume else "begins"
         log(f"process {os.getpid()} on {socket.gethostname()} {begins} the run ({runtime.name} runtime)")
         stack.enter_context(report)
-        stack.enter_context(runtime.around(directory.path, Path(registry), partial(_end_now, report, directory)))
+        served = Path("registry") if is_service(registry) else Path(registry)
+        stack.enter_context(runtime.around(directory.path, served, partial(_end_now, report, directory)))
         num_lost, furthest = 0, -1
         while True:
             reached = -1

@@ -2,6 +2,7 @@
 
 import logging
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from service.policies.numpy_policy import numpy_bob
 from service.registry.loading import load
 from service.registry.publishing import publish, publish_run
 from service.registry.registry import Registry
-from service.runs.train import open_run
+from service.runs.train import Runtime, open_run, train
 from service.store import run_directory
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import TREE, assert_same_run, play, tiny_config
@@ -67,6 +68,23 @@ def test_a_start_that_was_cut_off_can_be_tried_again(tmp_path, monkeypatch):
     assert {"checkpoints", "snapshots", "epochs", "tensorboard"} < left
     _, ended = play(tmp_path / "run")
     assert ended.reason == "finished"
+
+
+@pytest.mark.parametrize(("registry", "served"), [("http://host:8321", "registry"), ("elsewhere", "elsewhere")])
+def test_a_service_beside_a_run_has_the_usual_registry_where_primitives_come_by_http(tmp_path, registry, served):
+    found = []
+
+    class Beside(Runtime):
+        def around(self, directory, registry, end_now):
+            found.append(registry)
+            raise TandemError("seen")
+
+    with pytest.raises(TandemError, match="seen"):
+        train(
+            tiny_config(), RunDirectory(tmp_path / "run"), registry,
+            publish=False, on_iteration=lambda _: None, runtime=Beside(),
+        )  # fmt: skip
+    assert found == [Path(served)]
 
 
 def test_a_run_with_more_to_see_is_exact_when_resumed(tmp_path):
