@@ -26,6 +26,7 @@ import numpy as np
 from service.base import tensors
 from service.base.errors import DamagedBlobError, RegistryError, StorageError, UnknownVersionError, did_you_mean
 from service.base.files import open_to_append, os_errors, read_regular, write_atomic, write_exclusive
+from service.base.lock import LOCK_FILE
 from service.base.version import git_commit
 from service.registry import names
 from service.registry.manifest import Manifest, make_manifest, read_manifest
@@ -66,6 +67,12 @@ class Registry:
             if not path.is_dir() or not os.access(path, os.W_OK | os.X_OK):
                 what = "is not writable" if path.is_dir() else "is no directory"
                 raise RegistryError(f"cannot write {self.root}: {path} {what}; name another with --registry")
+        lock = None if name is None else self._alias_directory(name) / LOCK_FILE
+        if lock is not None and os.path.exists(lock) and not os.access(lock, os.W_OK):  # who published first made it
+            raise RegistryError(
+                f"cannot write {self.root}: {lock} is not writable; let its owner do chmod a+w, or name another "
+                "registry with --registry"
+            )
         # a file: it is found through whatever path leads to the directory
         if self.is_only_read or (self.root / READ_ONLY_FILE).exists():
             raise RegistryError(
@@ -331,7 +338,7 @@ class Registry:
         path = directory / names.check_alias(alias)
         with os_errors("write", path):
             directory.mkdir(parents=True, exist_ok=True)
-            with open_to_append(directory / ".lock") as lock:
+            with open_to_append(directory / LOCK_FILE) as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)  # closing the file frees it, and so does the process's death
                 if back or (self._read_alias(name, alias) or 0) < number:
                     write_atomic(path, f"{number}\n".encode())

@@ -368,3 +368,7 @@ def test_a_registry_in_which_only_another_user_may_publish_is_refused(
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "sha256")  # root may do everything
     with pytest.raises(RegistryError, match="sha256 is not writable"):
         registry.check_writable()
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != ".lock")  # made with a umask of 022
+    registry.check_writable("another-name")
+    with pytest.raises(RegistryError, match=r"panda-cube/aliases/\.lock is not writable; let its owner do chmod a\+w"):
+        registry.check_writable("panda-cube")
