@@ -178,6 +178,7 @@ class RedisWriter:
             pipe.watch(self._key("epoch"))
             if self._is_newer(pipe.get(self._key("epoch"))):
                 raise RunTakenError(self._run_id)
+            now_s, _ = pipe.time()  # of the clock that all runs share: a wrong one here would make others look old
             pipe.multi()
             pipe.set(self._key("epoch"), self._mine)  # a Redis that lost its data has forgotten it
             pipe.set(self._key("heartbeat"), 1, px=int(1000 * keys.HEARTBEAT_S))
@@ -185,8 +186,8 @@ class RedisWriter:
                 if value is not self._there.get(content):
                     pipe.set(self._key(content), value.model_dump_json())
                 if isinstance(value, RunStatus):
-                    pipe.zadd(keys.RUNS, {self._run_id: time.time()})
-                    pipe.zremrangebyscore(keys.RUNS, "-inf", time.time() - keys.KEPT_S)
+                    pipe.zadd(keys.RUNS, {self._run_id: now_s})
+                    pipe.zremrangebyscore(keys.RUNS, "-inf", now_s - keys.KEPT_S)
             key = self._key("metrics")
             for iteration, text in records:
                 pipe.zremrangebyscore(key, iteration, "+inf")

@@ -105,6 +105,18 @@ def test_an_older_process_does_not_take_the_place_of_a_newer_one(redis):
     newer.close()
 
 
+def test_a_machine_whose_clock_is_ahead_takes_no_other_run_from_the_list(redis, monkeypatch):
+    client, now_s = redis.address.client(1.0), time.time()
+    client.zadd(RUNS, {"ended": now_s})
+    monkeypatch.setattr(time, "time", lambda: now_s + 2 * address.KEPT_S)
+    ahead = a_writer(redis.address)
+    train(ahead, [1])
+    wait_until(lambda: client.zscore(RUNS, "cube"))
+    ahead.close()
+    assert set(client.zrange(RUNS, 0, -1)) == {b"ended", b"cube"}
+    assert client.zscore(RUNS, "cube") == pytest.approx(now_s, abs=600.0)
+
+
 def test_what_a_run_has_told_goes_some_time_after_its_last_report(redis, writer, reader):
     train(writer, range(1, 3))
     wait_until(lambda: reader.runs() and iterations(reader) == [1, 2])
