@@ -132,7 +132,8 @@ def champion() -> Trained:
 def full_disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Call with "write" or "fsync": from then on that finds the disk full; a write first stores half its bytes."""
 
-    def _write(path: Path, data: bytes) -> None:
+    def _write(path: Path, data: bytes | Iterator[bytes]) -> None:
+        data = data if isinstance(data, bytes) else b"".join(data)
         path.write_bytes(data[: len(data) // 2])
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

@@ -93,12 +93,18 @@ def _descriptor(path: Path, flags: int, *, follow: bool) -> int:
     return descriptor
 
 
-def write_atomic(path: Path, data: bytes, error_type: type[StorageError] = StorageError, *, flush: bool = True) -> None:
+def write_atomic(
+    path: Path,
+    data: bytes | Iterator[bytes],
+    error_type: type[StorageError] = StorageError,
+    *,
+    flush: bool = True,
+) -> None:
     """Put ``data`` at ``path``, replacing what was there in one step; the directory is made when missing.
 
     Args:
         path: of the file.
-        data: all that it holds then.
+        data: all that it holds then, or pieces of that, one after another.
         error_type: of the error.
         flush: whether to wait for the disk; without that, a power cut may leave an older content or none.
 
@@ -255,14 +261,14 @@ class Appender:
 
 
 @contextlib.contextmanager
-def _temporary(path: Path, data: bytes, *, flush: bool = True) -> Iterator[Path]:
+def _temporary(path: Path, data: bytes | Iterator[bytes], *, flush: bool = True) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.parent / _temporary_name()
     try:
         if flush:
             _write_flushed(temporary, data)
         else:
-            temporary.write_bytes(data)
+            temporary.write_bytes(data if isinstance(data, bytes) else b"".join(data))
         yield temporary
     finally:
         temporary.unlink(missing_ok=True)
@@ -272,9 +278,9 @@ def _temporary_name() -> str:
     return f"{TEMPORARY_PREFIX}{os.getpid()}-{secrets.token_hex(8)}"
 
 
-def _write_flushed(path: Path, data: bytes) -> None:
+def _write_flushed(path: Path, data: bytes | Iterator[bytes]) -> None:
     with open(path, "xb") as file:
-        file.write(data)
+        file.writelines([data] if isinstance(data, bytes) else data)
         file.flush()
         os.fsync(file.fileno())
 

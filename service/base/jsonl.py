@@ -7,13 +7,17 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from service.base.errors import StorageError
-from service.base.files import Appender, os_errors, read_regular, write_atomic
+from service.base.files import Appender, open_regular, os_errors, read_regular, write_atomic
 from service.base.parsing import ParseError, parse_json
+
+MAX_LINE_BYTES = 64 * 1024 * 1024
+"""Of a record in memory; of a line that is longer nothing is kept."""
 
 
 def plain(value: Any) -> Any:
@@ -33,7 +37,8 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
     Raises:
         StorageError: the file is missing or unreadable, or a line other than a torn last one is no JSON object.
     """
-    *lines, tail = _read(path).split(b"\n")
+    with os_errors("read", path):
+        *lines, tail = read_regular(path).split(b"\n")
     records = []
     for number, line in enumerate(lines, start=1):
         record = _parse(line)
@@ -66,29 +71,36 @@ class JsonlWriter(Appender):
         Raises:
             StorageError: the file cannot be read or written; it is then as it was.
         """
-        *lines, _ = _read(self.path, missing_ok=True).split(b"\n")
-        kept, newest, num_strange = list[bytes](), -1, 0
-        for line in lines:
-            number = (_parse(line) or {}).get("iteration")
-            if not isinstance(number, int) or not newest < number < 2**63:
-                num_strange += 1
-            elif number <= iteration:
-                kept.append(line)
-                newest = number
-        if self.path.exists():
+        num_kept, num_strange = 0, 0
+
+        def kept(file: BinaryIO) -> Iterator[bytes]:
+            nonlocal num_kept, num_strange
+            newest = -1
+            for line in _lines(file, self.path):
+                number = (_parse(line) or {}).get("iteration")
+                if not isinstance(number, int) or not newest < number < 2**63:
+                    num_strange += 1
+                elif number <= iteration:
+                    newest = number
+                    num_kept += 1
+                    yield line
+
+        with os_errors("read", self.path):
+            try:
+                file = open_regular(self.path)
+            except FileNotFoundError:
+                return 0, 0
+        with file:
             self.take_new_file()
-            write_atomic(self.path, b"".join(line + b"\n" for line in kept))  # also the same bytes: see Appender
-        return len(kept), num_strange
+            write_atomic(self.path, kept(file))  # also the same bytes: see Appender
+        return num_kept, num_strange
 
 
-def _read(path: Path, *, missing_ok: bool = False) -> bytes:
+def _lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
+    """Lines with their ends, one at a time, without a torn last one."""
     with os_errors("read", path):
-        try:
-            return read_regular(path)
-        except FileNotFoundError:
-            if not missing_ok:
-                raise
-            return b""
+        pieces = iter(partial(file.readline, MAX_LINE_BYTES), b"")
+        yield from (piece for piece in pieces if piece.endswith(b"\n"))
 
 
 def _parse(line: bytes) -> dict[str, Any] | None:

@@ -1,3 +1,5 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -64,6 +66,33 @@ def test_a_cut_keeps_the_bytes_of_records_in_their_order(path):
     _write(path, b'{"iteration": 1}\n' + strange + b'{"iteration": 3}\n{"iteration": 4}\n')
     assert writer.cut_after(3) == (2, 6)
     assert path.read_bytes() == b'{"iteration": 1}\n{"iteration": 3}\n'
+
+
+def test_a_cut_holds_a_line_at_a_time(path):
+    """A run of a million iterations has records of gigabytes."""
+    _write(path, b"".join(b'{"iteration": %d, "x": "%s"}\n' % (number, b"." * 10_000) for number in range(400)))
+    tracemalloc.start()
+    try:
+        assert JsonlWriter(path).cut_after(199) == (200, 0)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert path.stat().st_size > 2_000_000 > 4 * most
+    assert [record["iteration"] for record in read_jsonl(path)] == list(range(200))
+
+
+def test_a_cut_that_does_not_fit_or_cannot_be_read_changes_nothing(path, full_disk):
+    _write(path, b'{"iteration": 1}\n{"iteration": 2}\n')
+    full_disk("write")
+    with pytest.raises(StorageError) as error:
+        JsonlWriter(path).cut_after(1)
+    assert_one_line(error.value, "cannot write", path)
+    assert [record["iteration"] for record in read_jsonl(path)] == [1, 2]
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(StorageError) as error:
+        JsonlWriter(path).cut_after(1)
+    assert_one_line(error.value, "cannot read", path)
 
 
 def test_what_a_stale_process_records_is_not_read(path):
