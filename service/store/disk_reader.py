@@ -181,7 +181,8 @@ class DiskReader(RunReader):
 
     @override
     def ready(self) -> None:
-        self._list()
+        with self._reading_root():
+            os.scandir(self.root).close()
 
     def _status(self, run_id: str, path: Path) -> RunStatus:
         try:
@@ -247,13 +248,18 @@ class DiskReader(RunReader):
 
     def _list(self) -> dict[str, Path]:
         """Directory of each run, by its id."""
-        try:
+        with self._reading_root():
             self._found = run_directories(self.root)
+        return self._found
+
+    @contextmanager
+    def _reading_root(self) -> Iterator[None]:
+        try:
+            yield
         except OSError as error:
             raise StoreUnavailableError(
                 f"cannot read the runs in {self.root}: {error.strerror}; name the directory that holds run directories"
             ) from error
-        return self._found
 
     def _records_of(self, path: Path) -> RecordFile:
         return self._records.setdefault(path, RecordFile(path / METRICS_FILE))

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from service.base.errors import StoreError
+from service.base.errors import StoreError, StoreUnavailableError
 from service.base.jsonl import JsonlWriter
 from service.base.lock import DirectoryLock
 from service.store import disk_reader, tail
@@ -198,6 +198,19 @@ def test_a_list_that_takes_long_is_made_once_for_many(told, tmp_path, clock, mon
         clock.now_s, took_s[0] = max(asked_s, clock.now_s), takes_s
         assert [run.iteration for run in reader.runs()] == [1]
     assert made == [0.0, 2.9, 68.0, 68.1]
+
+
+def test_whether_it_is_ready_walks_no_run(tmp_path, monkeypatch):
+    """An orchestrator asks every few seconds, also where there are thousands of runs on a network's disk."""
+    for name in ("a", "b"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+    reader = DiskReader(tmp_path / "runs")
+    monkeypatch.setattr(disk_reader, "run_directories", lambda root: pytest.fail("it walks the runs"))
+    reader.ready()
+    (tmp_path / "runs").rename(tmp_path / "elsewhere")
+    with pytest.raises(StoreUnavailableError) as error:
+        reader.ready()
+    assert_one_line(error.value, f"cannot read the runs in {tmp_path / 'runs'}", "No such file")
 
 
 @pytest.mark.parametrize("size", [100, 17_000, 44_000])
