@@ -24,7 +24,7 @@ from service.store.models import ACTIVE, CONDITIONS, ActorStatus, Record, RunRea
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 NUM_ENDED_RUNS = 20
 FAILURES_S = 3600.0
-MAX_ACTIVE_RUNS = 50
+MAX_ACTIVE_RUNS = 500
 _STATES: tuple[RunState, ...] = get_args(RunState)
 _ACTOR_STATES: tuple[Literal["starting", "alive"], ...] = get_args(ActorStatus.model_fields["state"].annotation)
 _logger = logging.getLogger(__name__)
@@ -67,10 +67,14 @@ def _age_s(when: datetime) -> float:
 
 
 def _actor_age_s(run: RunStatus) -> float | None:
-    """Of those that have started: others may wait for a core for as long as the run goes on."""
+    """Of those that have started: others may wait for a core for as long as the run goes on.
+
+    By the clock of the run's machine alone, which both heartbeats are of: it may differ from the one here.
+    """
     if run.state not in ACTIVE:
         return None
-    return max((_age_s(actor.heartbeat) for actor in run.actors if actor.state == "alive"), default=None)
+    beats = [actor.heartbeat for actor in run.actors if actor.state == "alive"]
+    return (run.heartbeat - min(beats)).total_seconds() if beats else None
 
 
 RUN_METRICS: tuple[RunMetric, ...] = (
@@ -94,7 +98,8 @@ RUN_METRICS: tuple[RunMetric, ...] = (
     _run("rollouts_refused_total", "Rollouts seen before, or too old", lambda run, _: run.totals.rollouts_refused),
     _run("actor_replacements_total", "How often an actor, the learner or the generator was replaced",
          lambda run, _: run.totals.replacements),
-    _run("actor_heartbeat_age_seconds", "Seconds since the oldest heartbeat of the actors of an active run that are up",
+    _run("actor_heartbeat_age_seconds",
+         "Seconds from the oldest heartbeat of the actors that are up to the run's own, of an active run",
          lambda run, _: _actor_age_s(run)),
     _of_record("valid_goals_ratio", "alice/valid_fraction", "Fraction of Alice's goals that are valid"),
     _of_record("lifted_goals_ratio", "alice/lifted_fraction", "Fraction of valid goals that are in the air"),
@@ -206,11 +211,13 @@ class Telemetry(Collector):
 
 
 def shown(runs: list[RunStatus]) -> list[RunStatus]:
-    """Select ``MAX_ACTIVE_RUNS`` active runs, as they are listed, and the last ``NUM_ENDED_RUNS`` that ended.
+    """Select ``MAX_ACTIVE_RUNS`` active runs, those in the worst condition, and the last ``NUM_ENDED_RUNS`` that ended.
 
-    Those that failed or were interrupted within ``FAILURES_S`` come first: their alerts need them for minutes.
+    Of the latter those that failed or were interrupted within ``FAILURES_S`` come first: their alerts need them for
+    minutes.
     """
     active = [run for run in runs if run.state in ACTIVE]
+    active.sort(key=lambda run: CONDITIONS.index(run.condition), reverse=True)  # no alert without metrics
     # Not by their start, by which they are listed: a long run that failed just now would be gone before its alert.
     ended = sorted((run for run in runs if run.state not in ACTIVE), key=_urgency, reverse=True)
     return active[:MAX_ACTIVE_RUNS] + ended[:NUM_ENDED_RUNS]

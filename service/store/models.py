@@ -54,7 +54,7 @@ Condition = Literal["well", "clock", "redis", "disk", "stuck", "silent"]
 | condition | meaning |
 |---|---|
 | ``well`` | nothing |
-| ``clock`` | its heartbeat comes from the future: its machine's clock and the reader's differ |
+| ``clock`` | its heartbeat comes from the future, or a minute late: its machine's clock and the reader's differ |
 | ``redis`` | it is configured to report to Redis, which takes nothing |
 | ``disk`` | its files cannot be written, most likely because the disk is full |
 | ``stuck`` | its process has the run, and says nothing: it is frozen, or hangs |
@@ -189,21 +189,26 @@ class Pulse:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._seen: dict[str, tuple[datetime, float, float]] = {}
-        """By run: its heartbeat, and the clock at that and at the last look."""
+        self._seen: dict[str, tuple[datetime, float, float, float]] = {}
+        """By run: its heartbeat, the clock at that and at the last look, and by how much that heartbeat came late."""
 
     def look(self, status: RunStatus) -> tuple[RunStatus, float]:
-        """The status of a run, a warning in one from the future; and seconds since it was heard of, never negative."""
+        """The status of a run, with a warning where a clock is wrong; and seconds since it was heard of, at least 0."""
         heartbeat, now_s = status.heartbeat, self._clock()
         age = datetime.now(UTC) - heartbeat
         begun_s = now_s - max(0.0, age.total_seconds())
-        last, beat_s, looked_s = self._seen.get(status.run_id, (heartbeat, begun_s, now_s))
+        last, beat_s, looked_s, late_s = self._seen.get(status.run_id, (heartbeat, begun_s, now_s, 0.0))
         if heartbeat != last:  # it came at some time since the last look
-            beat_s = max(begun_s, looked_s)
-        self._seen[status.run_id] = heartbeat, beat_s, now_s
-        if status.state in ACTIVE and -age > MAX_AHEAD:
-            text = f"its heartbeat is {-age.total_seconds():.0f} s in the future: the clock of its machine, or the one"
-            status = status.suffering("clock", f"{text} here, is wrong")
+            beat_s, late_s = max(begun_s, looked_s), looked_s - begun_s
+        self._seen[status.run_id] = heartbeat, beat_s, now_s, late_s
+        where = None
+        if -age > MAX_AHEAD:
+            where = f"{-age.total_seconds():.0f} s in the future"
+        elif late_s > SILENT_AFTER.total_seconds():
+            where = f"{late_s:.0f} s in the past as it comes"
+        if status.state in ACTIVE and where is not None:
+            text = f"its heartbeat is {where}: the clock of its machine, or the one here, is wrong"
+            status = status.suffering("clock", text)
         return status, now_s - beat_s
 
 

@@ -105,6 +105,14 @@ def test_an_actor_that_has_not_started_is_not_silent(service):
     assert ("tandem_run_actor_heartbeat_age_seconds", ("run", "cube")) not in scrape(client)
 
 
+def test_an_actor_of_a_machine_whose_clock_is_slow_is_not_silent(service):
+    client, runs = service
+    then = datetime.now(UTC) - timedelta(seconds=30)
+    actors = tuple(actor.model_copy(update={"heartbeat": then}) for actor in status("cube").actors)
+    write_status(runs, "cube", heartbeat=then + timedelta(seconds=7), actors=actors)
+    assert value(scrape(client), "tandem_run_actor_heartbeat_age_seconds", run="cube") == 7
+
+
 def test_the_registry(tmp_path, home):
     with serve(home) as server, httpx.Client(base_url=server.url, **CLIENT) as client:
         samples = scrape(client)
@@ -162,10 +170,12 @@ def test_the_number_of_series_is_bounded():
     when, hour = datetime(2026, 1, 1, tzinfo=UTC), timedelta(hours=1)
     runs = [
         status(f"run-{number}", state=state, started=when - number * hour, heartbeat=when - number * hour)
-        for number, state in enumerate(["finished", "running"] * 100)
+        for number, state in enumerate(["finished", "running"] * 600)
     ]
+    runs[-1] = runs[-1].suffering("stuck", "it hangs")
+    runs[-3] = runs[-3].suffering("disk", "it is full")
     ids = [run.run_id for run in metrics.shown(runs)]
-    assert ids[:2] == ["run-1", "run-3"]
+    assert ids[:4] == ["run-1199", "run-1197", "run-1", "run-3"]
     ended = [f"run-{n}" for n in range(0, 2 * NUM_ENDED_RUNS, 2)]
     assert ids[metrics.MAX_ACTIVE_RUNS :] == ended  # however many are active: or none that fails would be told of
     ids = [run.run_id for run in metrics.shown(runs[:60])]

@@ -58,3 +58,25 @@ def test_a_heartbeat_from_the_future_says_that_a_clock_is_wrong():
     ]
     assert "is 60 s in the future" in Pulse().look(a_status(heartbeat=ago(-60.4)))[0].warnings[0]
     assert Pulse().look(a_status(heartbeat=ago(-60), state="finished"))[0].condition == "well"
+
+
+def test_a_heartbeat_that_comes_late_says_that_a_clock_is_wrong(pulse, clock):
+    def look(age_s, **more):
+        seen, _ = pulse.look(a_status(heartbeat=ago(age_s), **more))
+        return seen.condition, seen.warnings
+
+    assert look(3600) == ("well", ())  # nobody knows for how long it has been there
+    clock.now_s += 10.0
+    condition, (said,) = look(3609)
+    assert condition == "clock"
+    assert "is 3599 s in the past as it comes: the clock of its machine, or the one here, is wrong" in said
+    clock.now_s += 300.0
+    assert look(250) == ("well", ())  # the clock was set, and it beat while nobody looked
+    clock.now_s += 1.0
+    assert look(3600, state="finished") == ("well", ())
+
+
+def test_a_clock_is_wrong_until_another_heartbeat_comes(pulse, clock):
+    for heartbeat, condition in ((ago(3600), "well"), (beat := ago(3500), "clock"), (beat, "clock"), (ago(0), "well")):
+        assert pulse.look(a_status(heartbeat=heartbeat))[0].condition == condition
+        clock.now_s += 1.0
