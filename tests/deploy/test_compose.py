@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from tests.deploy.files import DEPLOY, NGINX, PROMETHEUS, ROOT, compose, scrape_job
+from tests.deploy.files import DEPLOY, NGINX, PROMETHEUS, ROOT, compose, manifest, scrape_job
 
 SERVICES = compose()["services"]
 ENV_EXAMPLE = (DEPLOY / "compose" / ".env.example").read_text()
@@ -126,3 +126,17 @@ def test_images_are_built_here_or_pinned():
             }.items()
         else:
             assert re.fullmatch(r"[\w/]+:v?\d+\.\d+[\w.-]*", service["image"])
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_no_log_fills_the_disk(name):
+    assert SERVICES[name]["logging"] == {"driver": "json-file", "options": {"max-size": "10m", "max-file": "3"}}
+
+
+def test_redis_is_bounded_as_on_kubernetes():
+    """A run that its Redis takes no more from has an alert; a machine without memory ends whatever it likes."""
+    (box,) = manifest("StatefulSet", "redis")["spec"]["template"]["spec"]["containers"]
+    settings = [
+        re.findall(r"^ *(maxmemory.*)$", text, re.MULTILINE) for text in (*SERVICES["redis"]["command"], *box["args"])
+    ]
+    assert settings == [["maxmemory 768mb", "maxmemory-policy noeviction"]] * 2
