@@ -120,8 +120,14 @@ def test_redis_is_where_it_is_looked_for():
     (port,) = manifest("Service", "redis")["spec"]["ports"]
     address = f"redis:{port['port']}"
     urls = [str(value) for _, value in walk(manifests()) if "redis://" in str(value)]
-    assert len(urls) == 3  # the status service and both heads
     assert {url.rsplit("@")[1] for url in urls} == {f"{address}/0"}
+    templates = [manifest("Deployment", "status")["spec"]["template"]]
+    for spec in ray_specs().values():  # a study's runs report from the workers
+        templates += [group["template"] for group in (spec["headGroupSpec"], *spec["workerGroupSpecs"])]
+    assert len(templates) == len(urls) == 7
+    for template in templates:
+        names = [variable["name"] for variable in template["spec"]["containers"][0]["env"]]
+        assert names[:2] == ["REDIS_PASSWORD", "TANDEM_REDIS_URL"]  # the second is made of the first
 
 
 @pytest.mark.parametrize("template", pod_templates(manifests()), ids=lambda each: each["spec"]["containers"][0]["name"])
