@@ -13,7 +13,7 @@ from pathlib import Path
 from service.base.errors import TandemError
 from service.base.files import TEMPORARY_PREFIX, os_errors
 from service.base.liveness import count_work
-from service.envs.rendering.renderer import Image, RenderError
+from service.envs.rendering.renderer import Image
 
 _H264 = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "21", "-preset", "veryfast", "-movflags", "+faststart")
 # One palette for all frames, and a regular pattern where a colour is not in it: frames that hardly change stay small.
@@ -37,8 +37,7 @@ def encode(frames: Iterator[Image], path: Path, *, fps: float) -> Path:
     """Write frames, all of one even size.
 
     Raises:
-        RenderError: no ffmpeg here.
-        TandemError: no such format, the disk is full, or the file cannot be written.
+        TandemError: no ffmpeg here, no such format, the disk is full, or the file cannot be written.
     """
     options = check_format(path)
     temporary = path.parent / f"{TEMPORARY_PREFIX}{os.getpid()}-{path.name}"
@@ -84,4 +83,4 @@ def _ffmpeg() -> str:
     try:
         return str(imageio_ffmpeg.get_ffmpeg_exe())
     except RuntimeError:
-        raise RenderError("cannot write a video: there is no ffmpeg; install it (apt-get install ffmpeg)") from None
+        raise TandemError("cannot write a video: there is no ffmpeg; install it (apt-get install ffmpeg)") from None

@@ -67,8 +67,7 @@ def write_video(
         ``path``.
 
     Raises:
-        RenderError: no OpenGL or no ffmpeg here.
-        TandemError: no such format, the disk is full, or the file cannot be written.
+        TandemError: no OpenGL or no ffmpeg here, no such format, the disk is full, or the file cannot be written.
     """
     options = options or FilmOptions()
     stride, frame_s = _timing(config, options.speed)

@@ -86,12 +86,12 @@ def test_pretrain_leaves_everything_a_person_looks_at_and_says_where(trained):
 
 
 def test_pretrain_films_rounds_where_pictures_can_be_drawn(trained):
-    from service.envs.rendering.renderer import RenderError, SceneRenderer
+    from service.envs.rendering.renderer import SceneRenderer
 
     video = trained.run / "rounds.mp4"
     try:
         SceneRenderer(tiny_config().world, 64, 48).close()
-    except RenderError:
+    except TandemError:
         assert "rounds.mp4" not in trained.result.stdout
         pytest.skip("videos need OpenGL: EGL or OSMesa, apt-get install libegl1")
     assert str(video) in trained.result.stdout

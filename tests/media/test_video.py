@@ -11,7 +11,7 @@ from service.base.errors import TandemError
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.rendering.camera import parse_view
-from service.envs.rendering.renderer import RenderError, SceneRenderer
+from service.envs.rendering.renderer import SceneRenderer
 from service.generator.validity import NO_GOAL, Verdict
 from service.media import encoding, video
 from service.media.recording import RecordedEpisodes, RecordedRound
@@ -25,7 +25,7 @@ SMALL = FilmOptions(width=2 * PANE, height=PANE + BAR_HEIGHT)
 def _needs_opengl():
     try:
         SceneRenderer(WorldConfig(), 16, 16).close()
-    except RenderError as error:
+    except TandemError as error:
         pytest.skip(str(error))
 
 

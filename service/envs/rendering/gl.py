@@ -31,10 +31,6 @@ _refused: list[str] = []
 """The value of MUJOCO_GL that ``protect_import`` put aside, if any."""
 
 
-class RenderError(TandemError):
-    """A machine that cannot draw; the message says what is missing."""
-
-
 def protect_import() -> None:
     """Let ``import mujoco`` succeed whatever MUJOCO_GL says: training draws nothing and must not fail for it.
 
@@ -56,7 +52,7 @@ def open_drawing(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, m
         A ``GLContext`` of MuJoCo, with ``make_current`` and ``free``, and what ``mjr_render`` draws with.
 
     Raises:
-        RenderError: no OpenGL here, or MUJOCO_GL turns it off.
+        TandemError: no OpenGL here, or MUJOCO_GL turns it off.
     """
     import mujoco  # not above: this module goes before it
 
@@ -71,7 +67,7 @@ def open_drawing(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, m
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, drawing)
     except Exception as error:  # ImportError, AttributeError, RuntimeError, GLError: every backend fails in its own way
         reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
-        raise RenderError(f"cannot draw: OpenGL by {backend} failed ({reason}); {_INSTALL}") from error
+        raise TandemError(f"cannot draw: OpenGL by {backend} failed ({reason}); {_INSTALL}") from error
     return context, drawing
 
 
@@ -81,10 +77,10 @@ def _requested() -> str:
 
 def _choose() -> str:
     if _refused:
-        raise RenderError(f"cannot draw: MUJOCO_GL={_refused[0]} names no OpenGL that is here; unset it, or {_INSTALL}")
+        raise TandemError(f"cannot draw: MUJOCO_GL={_refused[0]} names no OpenGL that is here; unset it, or {_INSTALL}")
     requested = _requested()
     if requested in _OFF:
-        raise RenderError(f"cannot draw: MUJOCO_GL={requested} turns rendering off; unset it")
+        raise TandemError(f"cannot draw: MUJOCO_GL={requested} turns rendering off; unset it")
     if requested not in _ANY:
         return "glfw" if requested in ("glx", "wgl") else requested
     backends = _BACKENDS.get(platform.system(), ("glfw",))

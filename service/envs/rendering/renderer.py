@@ -21,10 +21,8 @@ from service.envs.objects import geometry
 from service.envs.observations import each_object
 from service.envs.rendering.camera import DEFAULT_VIEW, CameraView
 from service.envs.rendering.decoration import decorate
-from service.envs.rendering.gl import RenderError, open_drawing
+from service.envs.rendering.gl import open_drawing
 from service.envs.scene import build_layout, build_spec
-
-__all__ = ["RenderError", "SceneRenderer"]
 
 Image = NDArray[np.uint8]
 
@@ -47,7 +45,7 @@ class SceneRenderer:
         view: where they are taken from.
 
     Raises:
-        RenderError: this machine has no OpenGL that works without a window.
+        TandemError: this machine has no OpenGL that works without a window.
     """
 
     def __init__(

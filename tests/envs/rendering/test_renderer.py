@@ -5,11 +5,12 @@ import sys
 import numpy as np
 import pytest
 
+from service.base.errors import TandemError
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.rendering.decoration import decorate
 from service.envs.rendering.gl import open_drawing
-from service.envs.rendering.renderer import RenderError, SceneRenderer
+from service.envs.rendering.renderer import SceneRenderer
 from service.envs.scene import build_spec
 
 WIDTH, HEIGHT = 200, 150
@@ -23,10 +24,11 @@ from service.envs.batch import WorldBatch
 import numpy as np
 with WorldBatch(WorldConfig(), 1, num_threads=1) as worlds:
     worlds.step(np.zeros((1, 4), dtype=np.float32))
-from service.envs.rendering.renderer import RenderError, SceneRenderer
+from service.base.errors import TandemError
+from service.envs.rendering.renderer import SceneRenderer
 try:
     SceneRenderer(WorldConfig(), 32, 32)
-except RenderError as error:
+except TandemError as error:
     print(error)
 """
 
@@ -34,7 +36,7 @@ except RenderError as error:
 def open_renderer(config=None, **options):
     try:
         return SceneRenderer(config or WorldConfig(), WIDTH, HEIGHT, **options)
-    except RenderError as error:
+    except TandemError as error:
         pytest.skip(str(error))
 
 
@@ -158,7 +160,7 @@ def test_closed_is_closed():
 
 def test_rendering_that_is_turned_off(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disabled")
-    with pytest.raises(RenderError, match="MUJOCO_GL=disabled turns rendering off; unset it"):
+    with pytest.raises(TandemError, match="MUJOCO_GL=disabled turns rendering off; unset it"):
         open_drawing(build_spec(WorldConfig()).compile(), 32, 32)
 
 
