@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.base.errors import ConfigError
+from service.base.errors import ConfigError, TandemError
 from service.base.files import read_regular
 from service.base.types import Array
 
@@ -147,6 +147,20 @@ def naming_errors_of(origin: str) -> Iterator[None]:
         if isinstance(error, ModuleNotFoundError):
             said += "; a file stands alone: put what it needs into it, or install that"
         raise CodeError(f"{where}: {type(error).__name__}{': ' * bool(said)}{said}") from error
+
+
+@contextmanager
+def naming_unexpected(origin: str | None) -> Iterator[None]:
+    """As ``naming_errors_of``, but for errors of which the code is not the cause; None: it is not a user's."""
+    try:
+        yield
+    except (TandemError, OSError, MemoryError):
+        raise
+    except Exception:
+        if origin is None:
+            raise
+        with naming_errors_of(origin):
+            raise
 
 
 def origin_of(kind: type) -> str | None:

@@ -17,6 +17,7 @@ from service.base.errors import RobotError, TandemError, in_metres
 from service.base.files import check_place
 from service.base.jsonl import JsonlWriter
 from service.base.types import StateArray
+from service.base.user_code import naming_unexpected
 from service.cli.common import CHAMPION, REFERENCE, SOURCE, ActsWithOption, CommandGroup, SourceOption, print_json
 from service.cli.evaluate import parse_points
 from service.config.load import explained
@@ -232,7 +233,7 @@ def _connected(
 
     A simulator and a dry run ask no question, and no key has to be held: they endanger no person.
     """
-    from service.robot.backends import connect, naming_errors
+    from service.robot.backends import connect, file_of
     from service.robot.safety import always_held
     from service.robot.watchdogs import HeldKey
 
@@ -257,7 +258,7 @@ def _connected(
             # a back-end of a user's may have swallowed what the signal raised
             return signals.first is None and (key or always_held)()
 
-        with naming_errors(described):
+        with naming_unexpected(file_of(described)):
             try:
                 yield backend, held, wait
             except RobotError:

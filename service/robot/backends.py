@@ -5,8 +5,6 @@ from __future__ import annotations
 import importlib
 import inspect
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,7 +13,6 @@ from pydantic import Field, ValidationError
 
 from service.base.errors import TandemError, did_you_mean, one_line
 from service.base.types import StateArray
-from service.base.user_code import naming_errors_of
 from service.config.frozen import FrozenModel, first_error
 from service.config.load import explained
 from service.config.tree import read_yaml
@@ -121,19 +118,10 @@ def read_backend(reference: str) -> BackendConfig:
         raise TandemError(f"robot {reference}: {explained(error, BackendConfig)}") from None
 
 
-@contextmanager
-def naming_errors(config: BackendConfig) -> Iterator[None]:
-    """Say of an unexpected error of a user's back-end where in its file it comes from."""
-    try:
-        yield
-    except (TandemError, OSError):
-        raise
-    except Exception:
-        module = sys.modules.get(config.backend.partition(":")[0])
-        if config.backend in BACKENDS or module is None or module.__file__ is None:
-            raise
-        with naming_errors_of(module.__file__):
-            raise
+def file_of(config: BackendConfig) -> str | None:
+    """The file of a user's back-end, once it is connected; None of ours."""
+    module = sys.modules.get(config.backend.partition(":")[0])
+    return None if config.backend in BACKENDS else getattr(module, "__file__", None)
 
 
 def connect(config: BackendConfig, world: WorldConfig, *, seed: int = 0) -> Backend:

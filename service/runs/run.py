@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -18,7 +18,7 @@ from service.base.errors import CheckpointError, ConfigError, DivergedError, Tan
 from service.base.jsonl import plain
 from service.base.tensors import split_parts
 from service.base.types import Arrays, Metrics
-from service.base.user_code import CodeError, naming_errors_of, origin_of
+from service.base.user_code import CodeError, naming_unexpected, origin_of
 from service.config import Config
 from service.methods.method import Iteration, Method, State
 from service.policies.parameters import Parameters, PolicyError
@@ -199,18 +199,9 @@ class Run:
             with self._tolerating(f"and saves again after {self.config.run.checkpoint_interval} iterations"):
                 self._save()
 
-    @contextmanager
-    def naming_errors(self) -> Iterator[None]:
+    def naming_errors(self) -> AbstractContextManager[None]:
         """Say of an unexpected error of a user's method where in its file it comes from."""
-        try:
-            yield
-        except (TandemError, OSError, MemoryError):  # of these the file is not the cause
-            raise
-        except Exception:
-            if self._origin is None:
-                raise
-            with naming_errors_of(self._origin):
-                raise
+        return naming_unexpected(self._origin)
 
     def _check(self, ended: object, before: int) -> None:
         """Check an iteration, which began at so many env steps; all of it if the method is a user's."""
