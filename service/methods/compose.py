@@ -124,6 +124,26 @@ class _ComposingWrapper:
         observation, *rest = self.env.step(self._compose(action))
         return (self._observe(observation), *rest)
 
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+        """The environment's own, where it has goals: hindsight relabelling asks for it here."""
+        return self._inner("compute_reward")(achieved_goal, desired_goal, info)
+
+    def state(self) -> Any:
+        """The environment's own, where it can be saved; composing has none."""
+        return self._inner("state")()
+
+    def restore(self, state: Any) -> Any:
+        """Go back to a saved state, and return the observation there: the next composition acts on it.
+
+        Nothing in between may change observations.
+        """
+        return self._observe(self._inner("restore")(state))
+
+    def _inner(self, name: str) -> Any:
+        """A method of the environment, or of one that it wraps; a ``VectorEnv`` is not asked for what it wraps."""
+        find = getattr(self.env, "get_wrapper_attr", None)
+        return find(name) if find is not None else getattr(self.env, name)
+
     def _observe(self, observation: Any) -> Any:
         """Keep the positions that the next composition acts on; gives the observation back."""
         self._last_positions = np.array(self._take(observation), dtype=np.float32)
@@ -175,21 +195,6 @@ class ComposePrimitives(
         super().__init__(env)
         self.action_space = self._compose_with(primitives, env.observation_space, env.action_space, positions, residual)
 
-    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
-        """The environment's own, where it has goals: hindsight relabelling asks for it here."""
-        return self.env.get_wrapper_attr("compute_reward")(achieved_goal, desired_goal, info)
-
-    def state(self) -> Any:
-        """The environment's own, where it can be saved; composing has none."""
-        return self.env.get_wrapper_attr("state")()
-
-    def restore(self, state: Any) -> Any:
-        """Go back to a saved state, and return the observation there: the next composition acts on it.
-
-        Nothing in between may change observations.
-        """
-        return self._observe(self.env.get_wrapper_attr("restore")(state))
-
 
 class ComposePrimitivesVector(_ComposingWrapper, gymnasium.vector.VectorWrapper[Any, FloatArray, Any, FloatArray, Any]):
     """N environments at once, as in ``ComposePrimitives``: actions are (N, K), ``positions`` takes out (N, P)."""
@@ -207,15 +212,3 @@ class ComposePrimitivesVector(_ComposingWrapper, gymnasium.vector.VectorWrapper[
             primitives, env.single_observation_space, env.single_action_space, positions, residual
         )
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, env.num_envs)
-
-    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
-        """The environments' own, where they have goals."""
-        return self.env.compute_reward(achieved_goal, desired_goal, info)
-
-    def state(self) -> Any:
-        """The environments' own, where they can be saved; composing has none."""
-        return self.env.state()
-
-    def restore(self, state: Any) -> Any:
-        """Go back to a saved state, and return the observation there."""
-        return self._observe(self.env.restore(state))
