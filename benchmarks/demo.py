@@ -24,6 +24,7 @@ from typing import Any
 from benchmarks.measuring import ROOT, machine, one_line_errors, write_json
 from benchmarks.training_process import scratch
 from service.base.errors import TandemError
+from service.base.jsonl import read_jsonl
 from service.runs.grid import parse_seeds
 
 FROM, TO = 150_000, 710_000
@@ -91,17 +92,12 @@ def watching(sizes: list[int]) -> Iterator[Callable[[str], None]]:
         ended.set()
 
 
-def records(path: Path) -> list[dict[str, float]]:
-    """The metrics of a run, in the order of iterations."""
-    return [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
-
-
 def run_seed(seed: int) -> dict[str, Any]:
     """Run the demo with the live world and nobody who looks; for JSON."""
     with scratch() as home:
         begun_s = time.monotonic()
         said = list(lines_of(tandem(home, "demo", "--seed", str(seed), "--run-dir", "demo")))
-        rows = records(home / "demo")
+        rows = read_jsonl(home / "demo" / "metrics.jsonl")
         status = json.loads((home / "demo" / "status.json").read_text())
         curve = [[row["time/wall_s"], row["env_steps"], row[_MIXED]] for row in rows if _MIXED in row]
         return {
@@ -126,7 +122,7 @@ def seconds_between(*words: str, watched: bool) -> float:
         for line in lines_of(tandem(home, *words, "--run-dir", "run")):
             if watched and (found := _ADDRESS.search(line)):
                 begin(found[1])
-        rows = records(home / "run")
+        rows = read_jsonl(home / "run" / "metrics.jsonl")
         if watched and len(sizes) < 100:
             raise TandemError(f"the live world sent {len(sizes)} messages")
         times = [next(row["time/wall_s"] for row in rows if row["env_steps"] >= steps) for steps in (FROM, TO)]

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from benchmarks.measuring import machine, one_line_errors, write_json
 from benchmarks.run_files import COUNTERS, FORMAT_VERSION, RANDOM, STAGES, Records, Run, blocks, thin
 from service.actors.coverage import NUM_SKILLS, RandomPolicy, composition_paths, skill_paths, visited_share
-from service.actors.evaluation import DeterministicPolicy, IdlePolicy, evaluate
+from service.actors.evaluation import DeterministicPolicy, Evaluation, IdlePolicy, evaluate
 from service.base.errors import TandemError
 from service.base.tensors import split_parts
 from service.base.types import StateArray
@@ -179,9 +179,21 @@ def _environment(directory: RunDirectory) -> dict[str, Any]:
     return environment
 
 
-def measure_tasks(
-    bob: DeterministicPolicy, config: Config, *, num_episodes: int = NUM_EPISODES
-) -> list[dict[str, Any]]:
+def play_task(policy: DeterministicPolicy, task: Task, config: Config, num_episodes: int, seed: int) -> Evaluation:
+    """A policy on one of ``tasks_in``, from fresh resets, evaluated as a run evaluates Bob."""
+    return evaluate(
+        policy,
+        task.world_from(config.world),
+        task.goal_kind,
+        num_episodes=num_episodes,
+        num_steps=config.run.evaluation_steps,
+        success_distance_m=config.success_distance_m,
+        seed=seed,
+        num_threads=config.run.num_threads,
+    )
+
+
+def measure_tasks(bob: DeterministicPolicy, config: Config) -> list[dict[str, Any]]:
     """Bob without noise and a policy that does nothing, from fresh resets.
 
     Returns:
@@ -190,16 +202,7 @@ def measure_tasks(
     rows = []
     for name, task in tasks_in(config.world).items():
         for label, policy in {"bob": bob, "idle": IdlePolicy()}.items():
-            result = evaluate(
-                policy,
-                task.world_from(config.world),
-                task.goal_kind,
-                num_episodes=num_episodes,
-                num_steps=config.run.evaluation_steps,
-                success_distance_m=config.success_distance_m,
-                seed=SEED,
-                num_threads=config.run.num_threads,
-            )
+            result = play_task(policy, task, config, NUM_EPISODES, SEED)
             rows.append({"policy": label, **result.as_dict(), "goals": name})
     return rows
 

@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.measuring import ROOT, machine, one_line_errors, write_json
-from benchmarks.record_run import tasks_in
+from benchmarks.record_run import play_task, tasks_in
 from benchmarks.trials import learn
-from service.actors.evaluation import evaluate
 from service.base.errors import TandemError
 from service.base.version import git_commit
 from service.config.load import load_config
@@ -57,11 +56,7 @@ def measure(directory: RunDirectory, config: SelfPlayConfig, at: Sequence[float]
         bob = numpy_bob({name.removeprefix(BOB): array for name, array in arrays.items() if name.startswith(BOB)})
         row: dict[str, Any] = {"asked": asked, "env_steps": env_steps}
         for kind, task in tasks.items():
-            found = evaluate(
-                bob, task.world_from(config.world), task.goal_kind,
-                num_episodes=NUM_EPISODES, num_steps=config.run.evaluation_steps,
-                success_distance_m=config.success_distance_m, seed=SEED, num_threads=config.run.num_threads,
-            )  # fmt: skip
+            found = play_task(bob, task, config, NUM_EPISODES, SEED)
             row[kind] = {"last": found.success_last, "ever": found.success_ever}
         rows.append(row)
     return rows

@@ -9,7 +9,7 @@ run again. The file says what was measured and with which settings, and keeps th
 from __future__ import annotations
 
 import argparse
-import os
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ from benchmarks.report.results import FORMAT_VERSION, TRIAL, Result
 from service.actors.evaluation import DeterministicPolicy, IdlePolicy
 from service.base.errors import TandemError
 from service.base.jsonl import read_jsonl
-from service.base.version import LEARNING_VERSION, git_commit
 from service.config import Config
 from service.config.load import parse_config
 from service.config.task import TaskConfig
@@ -29,7 +28,7 @@ from service.envs.tasks import find_task
 from service.methods.task_evaluation import FINAL_SEED, evaluate_on, numbers_of
 from service.registry.loading import load
 from service.runs.train import train
-from service.store.run_directory import RunDirectory
+from service.store.run_directory import RunDirectory, encode_result
 
 NUM_EPISODES = 1_000
 """Of the last evaluation."""
@@ -75,8 +74,8 @@ def _play(config: TaskConfig, registry: Path) -> dict[str, Any]:
     player: DeterministicPolicy = IdlePolicy() if idle else load(config.primitives, registry).player()
     num, seed = config.run.final_episodes, config.seed + FINAL_SEED
     found = evaluate_on(find_task(config.task, config.code), config.world, player, num, seed, config.run.num_threads)
-    made = {"git_commit": git_commit(), "learning_version": LEARNING_VERSION, "num_cores": os.cpu_count()}
-    return {"evaluation": numbers_of(found), "env_steps": 0, "wall_s": 0.0, "made": made}
+    result: dict[str, Any] = json.loads(encode_result({"evaluation": numbers_of(found), "env_steps": 0, "wall_s": 0.0}))
+    return result
 
 
 def _recorded(config: TaskConfig, registry: Path, result: dict[str, Any], records: Sequence[dict[str, Any]]) -> Result:
