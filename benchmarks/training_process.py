@@ -191,16 +191,14 @@ class Measured:
         return Sample(int(num_steps), self.wall_s, sum(self.role_cpu_s.values()))
 
 
-def measure_training(
-    training: Training, num_iterations: int, num_actors: int = 1, num_warmup: int = NUM_WARMUP_ITERATIONS
-) -> Measured:
+def measure_training(training: Training, num_iterations: int, num_actors: int = 1) -> Measured:
     """Measure about ``num_iterations`` iterations of a run that has just been started, then end it.
 
-    It is measured from when ``num_actors`` are alive and ``num_warmup`` iterations, at least 1, are over.
+    It is measured from when ``num_actors`` are alive and ``NUM_WARMUP_ITERATIONS`` are over.
     """
     rows: list[dict[str, Any]] = []
     marks = []
-    for num in (num_warmup, num_warmup + num_iterations):
+    for num in (NUM_WARMUP_ITERATIONS, NUM_WARMUP_ITERATIONS + num_iterations):
         while len(rows) < num:
             for row in training.wait_for(training.records.new):
                 # an actor that dies later is measured, too

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -75,7 +75,7 @@ class Service:
     shm_bytes: int
     stop_grace_s: float
     read_only: bool
-    profiles: Sequence[str] = field(default_factory=tuple)
+    profiles: Sequence[str]
 
 
 def read_services(path: Path, variables: Mapping[str, str]) -> dict[str, Service]:

@@ -106,9 +106,9 @@ def pretrain(run_id: str, settings: Sequence[str] = ()) -> list[str]:
     return words + [word for each in settings for word in ("--set", each)]
 
 
-def wait(what: str, ask: Callable[[], T | None], timeout_s: float = WAIT_S) -> T:
+def wait(what: str, ask: Callable[[], T | None]) -> T:
     """Ask until the answer is true, and return it; services that are away are asked again."""
-    end_s, last = time.monotonic() + timeout_s, ""
+    end_s, last = time.monotonic() + WAIT_S, ""
     while time.monotonic() < end_s:
         try:
             if answer := ask():
@@ -116,7 +116,7 @@ def wait(what: str, ask: Callable[[], T | None], timeout_s: float = WAIT_S) -> T
         except (OSError, TandemError, ValueError, LookupError) as error:
             last = f"; last: {error}"
         time.sleep(1.0)
-    raise TandemError(f"waited {timeout_s:.0f} s for: {what}{last}")
+    raise TandemError(f"waited {WAIT_S:.0f} s for: {what}{last}")
 
 
 def status_code(ask: Callable[[], Any]) -> int:

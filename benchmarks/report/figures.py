@@ -64,9 +64,9 @@ class Clock(NamedTuple):
     scale: float
 
 
-def _panel(axes: Axes, title: str, x: str, y: str, *, size: float = TITLE_SIZE) -> None:
+def _panel(axes: Axes, title: str, x: str, y: str) -> None:
     style_axes(axes)
-    axes.set_title(title, loc="left", fontsize=size, weight="bold", color=INK)
+    axes.set_title(title, loc="left", fontsize=TITLE_SIZE, weight="bold", color=INK)
     axes.set_xlabel(x, color=FAINT)
     axes.set_ylabel(y, color=FAINT)
 

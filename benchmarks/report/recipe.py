@@ -20,19 +20,17 @@ _GONE = {"generator": {"replay_over_cells": False}}
 """Keys that are gone and did something, with the values by which they did nothing."""
 
 
-def differences(recorded: Mapping[str, Any], other: Mapping[str, Any] | None = None) -> dict[str, tuple[Any, Any]]:
-    """Keys by which a recorded configuration differs from another one, with its value and the other's.
+def differences(recorded: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Keys by which a recorded configuration differs from the shipped recipe, with its value and the recipe's.
 
-    Args:
-        recorded: as the recorded file has it; keys that are newer have their defaults.
-        other: the same; None: the shipped recipe.
+    Keys that are newer than the recorded file have their defaults.
     """
     mine = dict(leaves(_tree(recorded)))
-    others = dict(leaves(_tree(other if other is not None else load_config(RECIPE_FILE).model_dump(mode="json"))))
+    ships = dict(leaves(_tree(load_config(RECIPE_FILE).model_dump(mode="json"))))
     return {
-        key: (mine.get(key), others.get(key))
-        for key in sorted({*mine, *others})
-        if mine.get(key) != others.get(key) and not key.startswith(_OF_ONE_RUN)
+        key: (mine.get(key), ships.get(key))
+        for key in sorted({*mine, *ships})
+        if mine.get(key) != ships.get(key) and not key.startswith(_OF_ONE_RUN)
     }
 
 

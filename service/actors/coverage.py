@@ -117,13 +117,13 @@ def object_paths(
     return each_object(paths).swapaxes(1, 2).reshape(-1, num_steps + 1, 3)
 
 
-def visited_share(paths: StateArray, workspace: WorkspaceConfig, *, cell_size_m: float = CELL_SIZE_M) -> float:
+def visited_share(paths: StateArray, workspace: WorkspaceConfig) -> float:
     """Share of the workspace's table cells (seen from above) into which any of (M, T, 3) paths moved the object.
 
     The cell in which an object started does not count for its own path.
     """
-    shape = np.array([round(workspace.length_x_m / cell_size_m), round(workspace.length_y_m / cell_size_m)])
-    cells = np.floor((paths[:, :, :2] - workspace.lower_m[:2]) / cell_size_m).astype(np.int64)
+    shape = np.array([round(workspace.length_x_m / CELL_SIZE_M), round(workspace.length_y_m / CELL_SIZE_M)])
+    cells = np.floor((paths[:, :, :2] - workspace.lower_m[:2]) / CELL_SIZE_M).astype(np.int64)
     inside = ((cells >= 0) & (cells < shape)).all(axis=2)
     moved = (cells != cells[:, :1]).any(axis=2)
     visited = cells[inside & moved]

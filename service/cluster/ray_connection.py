@@ -80,13 +80,12 @@ def num_gpus(device: str) -> int:
 
 
 @contextmanager
-def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None]:
+def connected(address: str | None) -> Iterator[None]:
     """Be a driver of a Ray cluster, for as long as the block runs.
 
     Args:
         address: ``auto`` for the one on this machine or of the Ray job that this process is, or ``HOST:PORT``; None for
             the job's, and outside of a job for a new one on this machine, which ends with the block.
-        num_cpus: of a new one; None: all there are.
 
     Raises:
         WorkersError: nothing there, another version of Ray or Python there, or it does not let us in; or Ray fails
@@ -109,7 +108,7 @@ def connected(address: str | None, num_cpus: int | None = None) -> Iterator[None
     with needs_extra("cluster", "--runtime ray"):
         import ray
     _check_reachable(address)
-    options: dict[str, Any] = {"num_cpus": num_cpus, "include_dashboard": False} if address is None else {}
+    options: dict[str, Any] = {"include_dashboard": False} if address is None else {}
     with StopSignals() as signals:
         wait = partial(answer, "stopping once Ray has started; again to end now")  # else some processes of its stay
         try:

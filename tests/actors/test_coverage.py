@@ -37,11 +37,8 @@ def test_visited_share_by_hand(trajectories, cells):
     assert visited_share(trajectories, SQUARE) == cells / 16
 
 
-def test_cells_of_another_size():
-    trajectories = paths([(0.025, 0.025), (-0.075, 0.025)])
-    assert visited_share(trajectories, SQUARE, cell_size_m=0.1) == 1 / 4
-    assert visited_share(trajectories, SQUARE, cell_size_m=0.02) == 1 / 100
-    assert visited_share(trajectories, WorkspaceConfig()) == 1 / 49
+def test_the_share_is_that_of_the_cells_of_its_workspace():
+    assert visited_share(paths([(0.025, 0.025), (-0.075, 0.025)]), WorkspaceConfig()) == 1 / 49
 
 
 def test_random_policy():

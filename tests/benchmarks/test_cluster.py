@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 
 import pytest
 
-from benchmarks import processes, scaling
+from benchmarks import processes, scaling, training_process
 from benchmarks.compare_commits import measure_commit
 from benchmarks.measuring import ROOT
 from benchmarks.training_process import Measured, Records, measure_training
@@ -118,13 +118,15 @@ class Scripted:
         self.stopped = True
 
 
-def test_it_is_measured_from_when_all_actors_are_up(tiny):
+def test_it_is_measured_from_when_all_actors_are_up(tiny, monkeypatch):
+    monkeypatch.setattr(training_process, "NUM_WARMUP_ITERATIONS", 1)
+
     def row(index, num_alive):
         return {"env_steps": 10.0 * index, "actor/num_alive": num_alive}
 
     portions = [[row(0, 0)], [row(1, 1), row(2, 2)], [row(3, 2), row(4, 1)]]  # one that dies later is measured, too
     run = Scripted(tiny, portions)
-    found = measure_training(run, 2, num_actors=2, num_warmup=1)
+    found = measure_training(run, 2, num_actors=2)
     assert run.stopped
     assert (found.sample.num_steps, len(found.rows)) == (20, 3)
 

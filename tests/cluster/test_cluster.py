@@ -51,7 +51,8 @@ def cluster():
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("OPENBLAS_NUM_THREADS", "7")
             patch.setenv("MUJOCO_GL", "glfw")
-            stack.enter_context(connected(None, num_cpus=4))
+            patch.setenv("RAY_OVERRIDE_RESOURCES", '{"CPU": 4}')
+            stack.enter_context(connected(None))
         yield
 
 
