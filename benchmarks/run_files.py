@@ -17,6 +17,7 @@ from service.base.types import StateArray
 from service.media.figures import column
 
 FORMAT_VERSION = 1
+"""Of the files of runs and of trials; no reader asks for it so far."""
 MAX_POINTS = 300
 """Most points of a series."""
 COUNTERS = ("iteration", "env_steps", "time/wall_s")

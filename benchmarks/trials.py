@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.measuring import one_line_errors, write_json
-from benchmarks.report.results import FORMAT_VERSION, TRIAL, Result
+from benchmarks.report.results import TRIAL, Result
+from benchmarks.run_files import FORMAT_VERSION
 from service.actors.evaluation import DeterministicPolicy, IdlePolicy
 from service.base.errors import TandemError
 from service.base.jsonl import read_jsonl

@@ -9,7 +9,6 @@ from typing import Any
 
 TRIAL = "cell"
 """Key of a trial's settings in these files, which call a trial a cell."""
-FORMAT_VERSION = 1
 Result = dict[str, Any]
 
 
