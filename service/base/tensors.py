@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from safetensors import SafetensorError
@@ -71,11 +71,6 @@ def digest_of(text: str, arrays: Mapping[str, np.ndarray]) -> str:
         digest.update(json.dumps([name, array.dtype.name, array.shape]).encode())
         digest.update(array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes())
     return digest.hexdigest()
-
-
-def describe(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Shape and dtype of each array, as a manifest lists them."""
-    return {name: {"shape": list(arrays[name].shape), "dtype": arrays[name].dtype.name} for name in sorted(arrays)}
 
 
 def join_parts(parts: Mapping[str, Mapping[str, Each]]) -> dict[str, Each]:

@@ -7,7 +7,7 @@ boxes are.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import mujoco
 import numpy as np
@@ -23,8 +23,7 @@ from service.envs.objects import GRIPPER_BIT
 from service.envs.observations import each_object
 
 GoalKind = Literal["table", "air", "mixed", "volume", "one"]
-TABLE: GoalKind = "table"
-GOAL_KINDS: tuple[GoalKind, ...] = (TABLE, "air", "mixed", "volume", "one")
+GOAL_KINDS: tuple[GoalKind, ...] = get_args(GoalKind)
 MIXED_AIR_SHARE = 0.7
 """Share of mixed goals drawn anywhere in the workspace's volume; the rest lie on the table (paper: p = 0.7)."""
 _NUM_DRAWS = 20
@@ -224,7 +223,7 @@ def sample_goals(
     def draw(num: int) -> StateArray:
         raised, goal = rng.integers(config.num_objects, size=num), np.empty((num, config.num_objects, 3))
         for index, body in enumerate(config.bodies):
-            of_kind, lying = (_goals_of(body, each, rng, num, config, success_distance_m) for each in (kind, TABLE))
+            of_kind, lying = (_goals_of(body, each, rng, num, config, success_distance_m) for each in (kind, "table"))
             goal[:, index] = np.where((raised == index)[:, None], of_kind, lying)
         return goal.reshape(num, -1)
 

@@ -12,15 +12,13 @@ from service.base.types import FloatArray
 from service.config.task_methods import find_method
 from service.envs.observations import ObservationLayout, layouts
 from service.policies.forward import FUNCTIONS
-from service.policies.numpy_actor import STEP_SCALE_M, numpy_actor
+from service.policies.numpy_actor import MOVED, STEP_SCALE_M, numpy_actor
 from service.policies.numpy_policy import NumpyMCPPolicy, NumpyPolicy
 from service.policies.parameters import Parameters
 from service.registry.learned import RESIDUAL, LearnedPolicy, action_weights, learner_inputs
 from service.registry.loading import Trained
 
 Outputs = dict[str, FloatArray]
-_MOVED = ("effector", "object")
-"""What an orchestrator sees the movements of."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +105,7 @@ def network_of_orchestrator(learned: Trained) -> Network:
         }
 
     entries = {entry.name: entry for entry in seen.positions.entries}
-    moved = [replace(entries[name], name=f"{name}_moved", offset=0.0, scale=STEP_SCALE_M) for name in _MOVED]
+    moved = [replace(entries[name], name=f"{name}_moved", offset=0.0, scale=STEP_SCALE_M) for name in MOVED]
     told = seen.gate.entries[len(entries) :]
     normalisation = ObservationLayout(*entries.values(), *moved, *told).normalisation
     shown = {

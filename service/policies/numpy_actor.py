@@ -17,13 +17,15 @@ LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 MCP_LOG_STD_MIN = -5.0
 """Of a primitive's: with less, one that is sure decides alone and the others get no gradient."""
 
+MOVED = ("effector", "object")
+"""What an actor sees the movements of."""
 STEP_SCALE_M = 0.02
 """Scale of movements in a step, as inputs: the hand's full speed is two to three times as much."""
 
 
 def moved_columns(layout: ObservationLayout) -> list[int]:
     """Columns of positions whose movements are inputs: end effector and objects."""
-    return [column for name in ("effector", "object") for column in range(layout[name].start, layout[name].stop)]
+    return [column for name in MOVED for column in range(layout[name].start, layout[name].stop)]
 
 
 NUM_MOTION_INPUTS = POSITIONS.size + len(moved_columns(POSITIONS))

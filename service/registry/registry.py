@@ -115,7 +115,10 @@ class Registry:
         fields: dict[str, Any] = {
             "name": name,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
-            "tensors": tensors.describe(parameters),
+            "tensors": {
+                name: {"shape": list(array.shape), "dtype": array.dtype.name}
+                for name, array in sorted(parameters.items())
+            },
             "spaces": dict(spaces),
             "normalisation": dict(normalisation),
             "config": dict(config),
