@@ -36,7 +36,6 @@ class Activity:
         title: what is done, such as ``evaluating``.
         total: how much there is to do; None: not known.
         unit: of the total, such as ``episodes``.
-        done: how much was done before, by another process.
     """
 
     bar: Bar
@@ -130,9 +129,7 @@ class Display:
         """Show an activity that begins."""
         self._bars.disable = not self.moves
         self._bars.start()
-        self._bars.add_task(
-            activity.title, total=activity.total, completed=activity.done, unit=activity.unit, note=activity.note
-        )
+        self._bars.add_task(activity.title, total=activity.total, unit=activity.unit, note="")
         activity.bar = self._bars.tasks[-1]
         activity.display, activity.told_s = self, self._get_time()
 
