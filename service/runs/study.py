@@ -42,7 +42,6 @@ from service.runs.train import publish_learned
 from service.store.disk_reader import DiskReader, run_id_of
 from service.store.models import MAX_BYTES, STUDY_FILE
 from service.store.run_directory import RunDirectory
-from service.store.run_history import BEFORE, of_another_version
 
 SHOW_S = 1.0
 """Time between two looks into the run directories."""
@@ -85,17 +84,14 @@ class Study:
         """Read ``study.json``.
 
         Raises:
-            TandemError: no study here, one of another version, or its file cannot be read.
+            TandemError: no study here, or its file cannot be read.
         """
         if not self.exists:
             raise ConfigError(f"no study in {self.path}: {STUDY_FILE} is missing; leave out --resume to begin one")
         with os_errors("read", self.file):
             data = read_regular(self.file, MAX_BYTES, follow=True)
         with suppress(ParseError, ValidationError):
-            tree = parse_json(data, self.file)
-            if isinstance(tree, dict) and "seeds" in tree:
-                raise ConfigError(of_another_version(self.file, BEFORE))
-            self._study = StudyFile.model_validate(tree)
+            self._study = StudyFile.model_validate(parse_json(data, self.file))
             return self._study
         raise StorageError(
             f"{self.file} does not name the runs of a study; restore it from a copy, or go on with each run by "

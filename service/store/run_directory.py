@@ -156,8 +156,6 @@ class RunDirectory:
             StorageError: the file that names its version cannot be read, or is damaged.
         """
         if not self.exists:
-            if (cell := self.path / "cell.json").is_file():  # of a task
-                raise ConfigError(of_another_version(cell, BEFORE))
             raise ConfigError(f"no run in {self.path}: {self.config_file.name} is missing; name the directory of a run")
         history = read_history(self.path)
         version = history.tandem if history is not None else BEFORE

@@ -609,7 +609,3 @@ def test_a_study_whose_file_cannot_be_read(tmp_path):
         with pytest.raises(TandemError) as error:
             study.read()
         assert_one_line(error.value, study.file, "does not name the runs")
-    study.file.write_text('{"seeds": [0], "from": null, "runs": {}}')
-    with pytest.raises(ConfigError) as error:
-        study.read()
-    assert_one_line(error.value, study.file, "use tandem 0.2")
