@@ -60,7 +60,7 @@ export class Versions {
       const found = await get(["v1", "primitives", this.name], [], signal);
       this.found = found;
       const more = found.num_versions > found.versions.length ? `, the newest ${found.versions.length} here` : "";
-      setText(this.summary, `${counted(found.num_versions, "version")}${more}. In Python: service.load("${this.name}@latest").`);
+      setText(this.summary, `${counted(found.num_versions, "version")}${more}. In Python: tandem_skills.load("${this.name}@latest").`);
       if (!runs) this.show(await publishers(signal), new Map());
     } catch (error) {
       if (!(error instanceof ApiError) || error.status === 0) throw error;
