@@ -88,7 +88,7 @@ def prepared(xp: Any, parameters: Parameters) -> dict[str, Any]:
             num_actions = parameters[bias].shape[-1] // 2
             ready[f"{squash}.low"] = xp.repeat(xp.stack([0.0 * low - MEAN_BOUND, low]), num_actions)
             ready[f"{squash}.span"] = xp.repeat(xp.stack([0.0 * low + 2.0 * MEAN_BOUND, high - low]), num_actions)
-    places = [name.removesuffix(".weight").rpartition(".") for name in parameters if name.endswith(".weight")]
+    places = {name.rpartition(".")[0].rpartition(".") for name in parameters}
     for layers in {layers for layers, _, place in places if place.isdigit()}:
         numbers = sorted(int(place) for other, _, place in places if other == layers)
         ready[layers] = [(ready[f"{layers}.{place}.weight"], ready[f"{layers}.{place}.bias"]) for place in numbers]

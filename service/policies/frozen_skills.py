@@ -11,8 +11,8 @@ from service.base.types import FloatArray
 from service.config.skills import Prior, SkillsConfig
 from service.envs.observations import BOB, POSITIONS
 from service.policies.forward import prepared, relu_layers
-from service.policies.numpy_actor import NUM_MOTION_INPUTS, NumpyActor, motion_inputs, relu_shapes
-from service.policies.parameters import Parameters, PolicyError, checked
+from service.policies.numpy_actor import NUM_MOTION_INPUTS, NumpyActor, motion_inputs
+from service.policies.parameters import Parameters, PolicyError, checked, fitting
 
 _OBJECT = POSITIONS["object"]
 _GREATEST_SKILL = 1.5
@@ -56,7 +56,7 @@ class FrozenSkills:
         config: of the method that learned them.
 
     Raises:
-        PolicyError: a parameter is missing, left over, of a wrong shape or not finite.
+        PolicyError: a parameter is missing, of a wrong shape or not finite.
     """
 
     def __init__(self, parameters: Parameters, config: SkillsConfig) -> None:
@@ -73,7 +73,9 @@ class FrozenSkills:
         self.size = self.actor.num_inputs - NUM_MOTION_INPUTS
         """Z."""
         network = {f"network.{name}": array for name, array in parts["network"].items()}
-        self.network = prepared(np, checked(network, relu_shapes(network, "network")))["network"]
+        with fitting():
+            self.network = prepared(np, checked(network))["network"]
+            relu_layers(np, self.network, np.zeros((1, len(self.network[0][0])), np.float32))
 
     def draw(self, num: int, rng: np.random.Generator) -> FloatArray:
         """(num, Z) skills of the prior."""

@@ -10,7 +10,7 @@ import numpy as np
 from service.base.types import FloatArray
 from service.envs.observations import POSITIONS, ObservationLayout
 from service.policies.forward import INPUT_CLIP, compose, prepared, relu_layers
-from service.policies.parameters import Parameters, Shapes, checked, layer_shapes, layer_sizes, shape_of
+from service.policies.parameters import Parameters, checked, fitting
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 """Bounds of an actor's log-std before the tanh (Haarnoja et al. 2018)."""
@@ -57,14 +57,15 @@ class NumpyActor:
         parameters: as exported.
 
     Raises:
-        PolicyError: a parameter is missing, left over, of a wrong shape or not finite.
+        PolicyError: a parameter is missing, of a wrong shape or not finite.
     """
 
     def __init__(self, parameters: Parameters) -> None:
-        expected = relu_shapes(parameters, "layers")
-        self.network = prepared(np, checked(parameters, expected))
-        *_, (num_outputs,) = expected.values()
-        self.num_inputs, self.num_actions = expected["layers.0.weight"][1], num_outputs // 2
+        with fitting():
+            self.network = prepared(np, checked(parameters))
+            layers = self.network["layers"]
+            self.num_inputs, self.num_actions = len(layers[0][0]), len(layers[-1][1]) // 2
+            self(np.zeros((1, self.num_inputs), np.float32))
 
     def __call__(self, inputs: FloatArray) -> FloatArray:
         """(N, A) actions at (N, I) inputs."""
@@ -76,18 +77,12 @@ class NumpyMCPActor(NumpyActor):
     """Actions ``tanh(mean)`` of an ``MCPActor``."""
 
     def __init__(self, parameters: Parameters) -> None:
-        num_primitives, hidden_size, num_outputs = shape_of(parameters, "output_weight", 3)
-        expected = {
-            "output_weight": (num_primitives, hidden_size, num_outputs),
-            "output_bias": (num_primitives, num_outputs),
-            "weight_floor": (),
-            **relu_shapes(parameters, "primitives", num_primitives * hidden_size),
-            **relu_shapes(parameters, "gate", num_primitives),
-        }
-        self.network = prepared(np, checked(parameters, expected))
-        self.num_inputs, self.num_actions = expected["gate.0.weight"][1], num_outputs // 2
-        self._heads = num_primitives, hidden_size
-        self._num_without_goal = expected["primitives.0.weight"][1]
+        with fitting():
+            self.network = prepared(np, checked(parameters))
+            num_primitives, hidden_size, num_outputs = self.network["output_weight"].shape
+            self._heads, self.num_actions = (num_primitives, hidden_size), num_outputs // 2
+            self._num_without_goal, self.num_inputs = (len(self.network[name][0][0]) for name in ("primitives", "gate"))
+            self(np.zeros((1, self.num_inputs), np.float32))
 
     def __call__(self, inputs: FloatArray) -> FloatArray:
         """(N, A) actions at (N, I) inputs."""
@@ -110,13 +105,3 @@ def numpy_actor(parameters: Parameters) -> NumpyActor:
         PolicyError: they are of neither.
     """
     return NumpyMCPActor(parameters) if "output_weight" in parameters else NumpyActor(parameters)
-
-
-def relu_shapes(parameters: Parameters, name: str, num_outputs: int | None = None) -> Shapes:
-    """Shapes that layers of ``sac_networks.make_layers`` below a name need to fit together.
-
-    Raises:
-        PolicyError: the first is missing, or a weight is no matrix.
-    """
-    (*hidden, last), inputs = layer_sizes(parameters, f"{name}.{{}}", 2), shape_of(parameters, f"{name}.0.weight", 2)[1]
-    return layer_shapes(f"{name}.{{}}", (inputs, *hidden, num_outputs or last), 2)

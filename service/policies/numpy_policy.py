@@ -16,16 +16,7 @@ import numpy as np
 from service.base.types import FloatArray
 from service.envs.observations import ACTION, POSITIONS
 from service.policies import forward
-from service.policies.parameters import (
-    Parameters,
-    PolicyError,
-    bob_shapes,
-    checked,
-    gaussian_shapes,
-    layer_sizes,
-    order_shapes,
-    shape_of,
-)
+from service.policies.parameters import Parameters, PolicyError, checked, fitting
 
 _SMALLEST, _GREATEST = 1e-30, 1e30
 """Of a row's greatest weight: beyond these the product of Gaussians may overflow float32."""
@@ -69,11 +60,12 @@ class NumpyGaussianPolicy(NumpyPolicy):
         """Take the parameters of a ``networks.GaussianPolicy``.
 
         Raises:
-            PolicyError: a parameter is missing, left over, of a wrong shape or not finite.
+            PolicyError: a parameter is missing, of a wrong shape or not finite.
         """
-        (self._num_inputs,) = shape_of(parameters, "input.offset", 1)
-        expected = gaussian_shapes(self._num_inputs, layer_sizes(parameters, "hidden.{}")) | order_shapes(parameters)
-        self.network, self.columns = forward.prepared(np, checked(parameters, expected)), {}
+        with fitting():
+            self.network, self.columns = forward.prepared(np, checked(parameters)), {}
+            self._num_inputs = len(parameters["input.offset"])
+            self.distribution(np.zeros(self._num_inputs, np.float32))
 
     def distribution(self, observation: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and std, (..., A) each; see ``NumpyPolicy.distribution``."""
@@ -89,20 +81,22 @@ class NumpyMCPPolicy(NumpyPolicy):
         """Take the parameters of a ``networks.MCPPolicy``.
 
         Raises:
-            PolicyError: a parameter is missing, left over, of a wrong shape or not finite.
+            PolicyError: a parameter is missing, of a wrong shape or not finite.
         """
-        (self.num_positions,) = shape_of(parameters, "primitives.input.offset", 1)
-        """P; the observation O is these and the goal."""
-        self.num_primitives, head_size, _ = shape_of(parameters, "primitives.output_weight", 3)
-        trunk, gate = (layer_sizes(parameters, name) for name in ("primitives.trunk.{}", "gate.hidden.{}"))
-        (num_seen,) = shape_of(parameters, "gate.input.offset", 1)
-        self.num_goal = 3 * max(round((num_seen - self.num_positions) / 6), 1)
-        """3 for each object."""
-        first, goal = POSITIONS["object"].start, slice(self.num_positions, self.num_positions + self.num_goal)
-        of_objects = slice(first, first + self.num_goal)
-        self.columns = {"positions": slice(0, self.num_positions), "object": of_objects, "goal": goal}
-        expected = bob_shapes(self.num_positions, self.num_goal, trunk, (self.num_primitives, head_size), gate)
-        self.network = forward.prepared(np, checked(parameters, expected | order_shapes(parameters)))
+        with fitting():
+            self.network = forward.prepared(np, checked(parameters))
+            self.num_positions = len(parameters["primitives.input.offset"])
+            """P; the observation O is these and the goal."""
+            self.num_primitives = len(parameters["primitives.output_weight"])
+            self.num_goal = (len(parameters["gate.input.offset"]) - self.num_positions) // 2
+            """3 for each object; the gate also sees the ways to the goals."""
+            first, num_seen = POSITIONS["object"].start, self.num_positions + self.num_goal
+            self.columns = {
+                "positions": slice(0, self.num_positions),
+                "object": slice(first, first + self.num_goal),
+                "goal": slice(self.num_positions, num_seen),
+            }
+            self.distribution(np.zeros(num_seen, np.float32))
 
     def primitives(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Means and variances, (..., K, A) each, of the primitives at (..., P) positions.

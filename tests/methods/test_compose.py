@@ -4,6 +4,7 @@ import dataclasses
 import math
 import re
 import warnings
+from itertools import pairwise
 from pathlib import Path
 
 import gymnasium
@@ -26,7 +27,6 @@ from service.methods.compose import (
 )
 from service.policies.frozen_skills import FrozenSkills
 from service.policies.numpy_policy import NumpyGaussianPolicy
-from service.policies.parameters import gaussian_shapes, layer_shapes
 from service.registry.learned import action_weights
 from service.registry.loading import parameters_digest
 
@@ -182,10 +182,20 @@ def test_the_digest_sees_a_single_bit(trained):
     assert parameters_digest(primitives) != parameters_digest(trained.primitives)
 
 
+def layers(name, *sizes, step=1):
+    """Shapes of weights and biases between every two neighbours of sizes."""
+    found = {}
+    for place, (inputs, outputs) in enumerate(pairwise(sizes)):
+        layer = name.format(step * place)
+        found |= {f"{layer}.weight": (outputs, inputs), f"{layer}.bias": (outputs,)}
+    return found
+
+
 def test_digests_stay_what_they_were_when_the_first_were_recorded():
     """Of Bob, ``tests/benchmarks`` has recorded ones."""
-    alone = gaussian_shapes(5, (3, 2))
-    skills = layer_shapes("actor.layers.{}", (20, 3, 8), 2) | layer_shapes("network.{}", (3, 2, 3), 2)
+    names = ("input.offset", "input.scale", "squash.log_std_min", "squash.log_std_max")
+    alone = dict(zip(names, ((5,), (5,), (), ()), strict=True)) | layers("hidden.{}", 5, 3, 2) | layers("output", 2, 8)
+    skills = layers("actor.layers.{}", 20, 3, 8, step=2) | layers("network.{}", 3, 2, 3, step=2)
     alone, skills = (
         {name: np.arange(1, 1 + math.prod(shape), dtype=np.float32).reshape(shape) for name, shape in shapes.items()}
         for shapes in (alone, skills)
