@@ -126,7 +126,7 @@ def seconds_between(*words: str, watched: bool) -> float:
         if watched and len(sizes) < 100:
             raise TandemError(f"the live world sent {len(sizes)} messages")
         times = [next(row["time/wall_s"] for row in rows if row["env_steps"] >= steps) for steps in (FROM, TO)]
-        return times[1] - times[0]
+        return float(times[1] - times[0])
 
 
 def cost(seed: int, pairs: int) -> dict[str, Any]:

@@ -75,8 +75,7 @@ def _play(config: TaskConfig, registry: Path) -> dict[str, Any]:
     player: DeterministicPolicy = IdlePolicy() if idle else load(config.primitives, registry).player()
     num, seed = config.run.final_episodes, config.seed + FINAL_SEED
     found = evaluate_on(find_task(config.task, config.code), config.world, player, num, seed, config.run.num_threads)
-    result: dict[str, Any] = json.loads(encode_result({"evaluation": numbers_of(found), "env_steps": 0, "wall_s": 0.0}))
-    return result
+    return dict(json.loads(encode_result({"evaluation": {**numbers_of(found)}, "env_steps": 0, "wall_s": 0.0})))
 
 
 def _recorded(config: TaskConfig, registry: Path, result: dict[str, Any], records: Sequence[dict[str, Any]]) -> Result:
