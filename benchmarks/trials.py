@@ -91,7 +91,6 @@ def _recorded(config: TaskConfig, registry: Path, result: dict[str, Any], record
         "sac": config.sac.model_dump(mode="json"),
         "curve_every": run.evaluation_interval,
         "curve_episodes": run.evaluation_episodes,
-        "skill_steps": config.hold_steps,
         "reward_margin_m": config.reward_margin_m,
         "num_episodes": run.final_episodes,
         "task_version": config.task_version,

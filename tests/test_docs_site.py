@@ -96,7 +96,7 @@ def test_every_command_and_option_is_in_the_reference():
 def test_every_key_is_in_the_reference():
     text = docs_reference.configuration()
     keys = [key for kind in docs_reference.method_classes() for key in docs_reference.keys(kind)]
-    assert {"learner.bob.learning_rate", "skills.sac.tau", "skill_steps", "distillation.num_worlds"} <= set(keys)
+    assert {"learner.bob.learning_rate", "skills.sac.tau", "reward_margin_m", "distillation.num_worlds"} <= set(keys)
     assert [key for key in keys if f"| `{key}` |" not in text] == []
     assert "| `world.num_substeps` | `20` | `8` | `>= 1`, `<= 200` | physics steps per action;" in text
 

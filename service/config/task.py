@@ -13,10 +13,6 @@ from service.base.errors import ConfigError
 from service.base.user_code import parse_reference
 from service.config.run import SUCCESS_DISTANCE_M, Config, RunConfig
 from service.config.skills import SACConfig
-from service.config.task_methods import TASK_METHODS
-
-_UNUSED_SKILL_STEPS = (1, 5)
-"""What configurations of other methods say: the default, and the one of earlier versions."""
 
 
 class TaskRunConfig(RunConfig):
@@ -43,11 +39,6 @@ class TaskConfig(Config):
     )
     primitives_digest: str | None = Field(None, description="of their parameters; a new run records it")
     sac: SACConfig = SACConfig()
-    skill_steps: int = Field(
-        1,
-        ge=1,
-        description="env steps that a skill is held: 5 and 25 were worse (docs/results, T20)",
-    )
     reward_margin_m: float = Field(
         0.01,
         ge=0.0,
@@ -65,16 +56,6 @@ class TaskConfig(Config):
     def directory_name(self) -> str:
         """Usual name of the run's directory: seeds of a method lie side by side."""
         return f"{self.name}-{self.seed}"
-
-    @property
-    def hold_steps(self) -> int:
-        """Env steps that an action of the learner lasts."""
-        return self.skill_steps if self._takes_skills else 1
-
-    @property
-    def _takes_skills(self) -> bool:
-        method = TASK_METHODS.get(self.method)
-        return method is not None and method.takes == "skills"
 
     def as_in(self, saved: Self) -> Self:
         """The same, with the exact version of the primitives and their world, where these may be those of ``saved``."""
@@ -97,7 +78,11 @@ class TaskConfig(Config):
     @model_validator(mode="before")
     @classmethod
     def _has_a_name(cls, values: Any) -> Any:
-        if not isinstance(values, Mapping) or "name" in values:
+        if not isinstance(values, Mapping):
+            return values
+        # runs that earlier commits of 0.3 began say that a skill is held for one step
+        values = {key: value for key, value in values.items() if (key, value) != ("skill_steps", 1)}
+        if "name" in values:
             return values
         file = Path(str(values.get("task"))).name.lower()  # without its directory and its ending
         task = re.sub(r"(\.py)?[^a-z0-9._]+|\.py$", "-", file).strip("-._")[:30]
@@ -112,12 +97,6 @@ class TaskConfig(Config):
                 "so many env steps have random actions, and nothing is learned"
             )
         length_known = parse_reference(self.task) is None or bool(self.code)
-        if length_known and self.hold_steps > self.episode_steps:
-            raise ValueError(
-                f"skill_steps {self.skill_steps}: an episode has {self.episode_steps} steps; hold it shorter"
-            )
-        if self.skill_steps not in _UNUSED_SKILL_STEPS and not self._takes_skills:
-            raise ValueError(f"skill_steps is for methods that take skills, and {self.method} takes none: leave it out")
         if self.method.endswith("-her") and length_known and starts < episodes:
             raise ValueError(
                 f"sac.learning_starts = {starts}: goals are relabelled from whole episodes, so give at least "

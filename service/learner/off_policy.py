@@ -32,8 +32,6 @@ class Step(NamedTuple):
     """(N, P) positions one step before ``positions``."""
     positions: FloatArray
     """(N, P) that were acted on."""
-    before: FloatArray
-    """(N, P) one env step before ``following``: those that were acted on, where an action lasts for one."""
     following: FloatArray
     """(N, P) that the actions led to."""
     goal: FloatArray
@@ -57,9 +55,6 @@ class TabletopWorlds(ABC):
         env: restarts episodes in the same step (``gymnasium.vector.AutoresetMode.SAME_STEP``).
         seed: episodes begin here; world i draws its own from ``seed + i``.
     """
-
-    steps_per_action = 1
-    """Env steps that an action lasts."""
 
     def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int) -> None:
         self.env: Any = env
@@ -95,7 +90,6 @@ class TabletopWorlds(ABC):
             success[world] = info["final_info"]["is_success"][world]
         step = Step(
             self.previous,
-            self.positions,
             self.positions,
             following,
             self.goal,
@@ -159,7 +153,7 @@ class OffPolicyLoop:
     @property
     def num_env_steps(self) -> int:
         """Env steps made so far, those of uniform actions among them."""
-        return self.replay.num_added * self.replay.num_worlds * self.worlds.steps_per_action
+        return self.replay.num_added * self.replay.num_worlds
 
     def play(self, num_env_steps: int) -> Metrics:
         """Make at least so many env steps, with their updates, and average the actor.

@@ -102,7 +102,7 @@ class TaskLearning(Method):
     def player(self) -> DeterministicPolicy:
         """The policy learned so far, at the start of new episodes."""
         acts_with, config = self._acts_with if self._how.takes else None, self._acts_with.config
-        return learned_policy(self.parameters(), acts_with, config, self._worlds.steps_per_action)
+        return learned_policy(self.parameters(), acts_with, config)
 
     def close(self) -> None:
         """Stop the worlds' threads; a second call does nothing."""
@@ -146,7 +146,7 @@ class TaskLearning(Method):
             num_threads=config.run.num_threads,
         )
         if self._how.takes == "skills":
-            return SkillTaskWorlds(env, seed, acts_with.skills, config.hold_steps)
+            return SkillTaskWorlds(env, seed, acts_with.skills)
         if self._how.composes:
             env = ComposePrimitivesVector(env, acts_with, residual=RESIDUAL if self._how.adds_action else 0.0)
         return TaskWorlds(env, seed, layouts(acts_with.config.world))
@@ -190,7 +190,7 @@ class Hindsight:
             learner_inputs(rows["previous"], rows["positions"], rows["goal"], self._worlds.seen),
             rows["action"],
             rows["reward"][:, 0],
-            learner_inputs(rows["before"], rows["following"], rows["goal"], self._worlds.seen),
+            learner_inputs(rows["positions"], rows["following"], rows["goal"], self._worlds.seen),
         )
 
 
@@ -203,14 +203,8 @@ def _mixed(achieved: FloatArray, asked: FloatArray, rng: np.random.Generator) ->
 
 
 def make_loop(config: TaskConfig, method: TaskMethod, trained: Trained, worlds: TaskWorlds) -> OffPolicyLoop:
-    """Make a new learner in worlds that have begun; ``loop.make_batch`` is its ``Hindsight``.
-
-    Where an action lasts for H env steps, updates an env step and the horizon in env steps stay: H times the updates
-    after each action, and a discount of ``gamma ** H``.
-    """
-    size, hold = worlds.num_actions, worlds.steps_per_action
-    longer = {"gradient_steps": hold * config.sac.gradient_steps, "gamma": config.sac.gamma**hold}
-    sac = config.sac.model_copy(update=longer)
+    """Make a new learner in worlds that have begun; ``loop.make_batch`` is its ``Hindsight``."""
+    size, sac = worlds.num_actions, config.sac
     num_without_goal, num_seen = num_inputs(worlds.seen)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(spread_seed(config.seed, 0))
@@ -220,7 +214,7 @@ def make_loop(config: TaskConfig, method: TaskMethod, trained: Trained, worlds: 
             else GaussianActor(num_seen, size, sac.hidden_sizes)
         )
     learner = SACLearner(actor, num_seen, size, sac, spread_seed(config.seed, 1))
-    num_steps = -(-config.run.total_env_steps // (sac.num_worlds * hold))  # everything is kept
+    num_steps = -(-config.run.total_env_steps // sac.num_worlds)  # everything is kept
     own = worlds.env.unwrapped.rules.task.is_own
     replay = ReplayBuffer(num_steps, sac.num_worlds, {**columns(worlds.seen, view=own), "action": size})
     return OffPolicyLoop(worlds, replay, learner, Hindsight(worlds, method.her_ratio), spread_seed(config.seed, 2))

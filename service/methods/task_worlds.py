@@ -18,14 +18,14 @@ from service.learner.replay import Columns
 from service.policies.frozen_skills import FrozenSkills
 from service.registry.learned import learner_inputs
 
-_POSITIONS = ("previous", "positions", "before", "following")
+_POSITIONS = ("previous", "positions", "following")
 
 
 def columns(seen: Layouts, *, view: bool = False) -> dict[str, int]:
     """Sizes of a transition's columns, by name, but for ``action``.
 
-    They are positions one env step ago, now, one env step before it ended and when it ended, goal and reward; with
-    ``view`` also what the functions of a task saw when it ended.
+    They are positions one env step ago, now and when it ended, goal and reward; with ``view`` also what the functions
+    of a task saw when it ended.
     """
     num = seen.num_objects
     kept = {**dict.fromkeys(_POSITIONS, seen.positions.size), "goal": 3 * num, "reward": 1}
@@ -89,13 +89,10 @@ class SkillTaskWorlds(TaskWorlds):
         env: see ``TaskWorlds``.
         seed: of episodes.
         skills: act; never changed.
-        hold_steps: env steps that a skill is held. Where it does not divide an episode, the last one is shorter.
     """
 
-    def __init__(
-        self, env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, skills: FrozenSkills, hold_steps: int
-    ) -> None:
-        self._skills, self.steps_per_action = skills, hold_steps
+    def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any], seed: int, skills: FrozenSkills) -> None:
+        self._skills = skills
         super().__init__(env, seed)
 
     @property
@@ -104,23 +101,6 @@ class SkillTaskWorlds(TaskWorlds):
         return int(self._skills.size)
 
     def advance(self, actions: FloatArray) -> Step:
-        """Hold the skills of (N, Z) actions; rewards are summed.
-
-        A world whose episode ends on the way plays on in its next one, by the same skill: the learner sees that one
-        from where it then is, and the rewards until then count nowhere.
-        """
+        """Act by the skills of (N, Z) actions."""
         skill = self._skills.from_action(actions)
-        total = super().advance(self._skills.actions(self.previous, self.positions, skill))
-        for _ in range(self.steps_per_action - 1):
-            step = super().advance(self._skills.actions(self.previous, self.positions, skill))
-            goes_on = ~total.ended
-            last = goes_on[:, None]
-            total = total._replace(
-                before=np.where(last, step.before, total.before),
-                following=np.where(last, step.following, total.following),
-                reward=np.where(goes_on, total.reward + step.reward, total.reward),
-                ended=total.ended | step.ended,
-                success=np.where(goes_on, step.success, total.success),
-                view=None if step.view is None or total.view is None else np.where(last, step.view, total.view),
-            )
-        return total
+        return super().advance(self._skills.actions(self.previous, self.positions, skill))

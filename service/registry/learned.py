@@ -96,7 +96,7 @@ class LearnedPolicy:
         parameters: of the actor, as exported.
         acts_with: primitives or skills; None: the actor acts by itself.
         seen: layouts of the world that it was learned in.
-        hold_steps: env steps that an action of the actor lasts.
+        hold_steps: env steps that an action of the actor lasts; more than one only where it was published so.
     """
 
     def __init__(self, parameters: Parameters, acts_with: Frozen, seen: Layouts, hold_steps: int = 1) -> None:

@@ -424,7 +424,7 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
         acts_with = None
         if config.primitives_digest is not None:
             acts_with = _find_frozen(label, config.primitives, config.primitives_digest, place)
-        policy = learned_policy(parameters, acts_with, config, config.hold_steps)
+        policy = learned_policy(parameters, acts_with, config)
         task = find_task(config.task, config.code, config.task_world)
         about: dict[str, Any] = {"task": task, "method": config.method, "acts_with": acts_with}
         return Trained(label, "orchestrator", config, policy, parameters, path=path, **about)
@@ -441,7 +441,9 @@ def _load_run(label: str, directory: RunDirectory, file: Path | None, place: tup
     )
 
 
-def learned_policy(parameters: Parameters, acts_with: Trained | None, config: Config, hold_steps: int) -> LearnedPolicy:
+def learned_policy(
+    parameters: Parameters, acts_with: Trained | None, config: Config, hold_steps: int = 1
+) -> LearnedPolicy:
     """A policy of a task, of its actor's parameters, and of what it acts with, learned in the world of ``config``."""
     frozen = None if acts_with is None else acts_with.skills if acts_with.kind == "skills" else acts_with.primitives
     return LearnedPolicy(parameters, frozen, layouts(config.world), hold_steps)

@@ -152,7 +152,7 @@ def _described(config: Config) -> dict[str, Any]:
             "task": config.task,
             "task_version": config.task_version,
             "method": config.method,
-            "hold_steps": config.hold_steps,
+            "hold_steps": 1,  # earlier versions could hold a skill for longer
             "primitives": config.primitives,
             "primitives_digest": config.primitives_digest,
         }

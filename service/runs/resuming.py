@@ -59,7 +59,8 @@ def changed_settings(saved: dict[str, Any], config: Config, directory: Path) -> 
     Raises:
         CheckpointError: a setting that may not change.
     """
-    changed = _differences(saved, config)
+    was = type(config).model_validate(saved)  # it may have keys that are gone
+    changed = _differences(was.model_dump(mode="json"), config)
     for key, (old, new) in changed.items():
         if not f"{key}=".startswith(config.resumable):
             raise CheckpointError(

@@ -187,7 +187,6 @@ def test_methods_and_tasks_are_listed():
         (["wall", "--set", "gamma=0.9"], "did you mean sac.gamma?"),
         (["wall", "--set", "sac.gamma=2"], "gamma = 2: Input should be less than 1"),
         (["wall", "--set", "reward_margin_m=0.05"], "reward_margin_m = 0.05: Input should be less than 0.05"),
-        (["wall", "--set", "skill_steps=3"], "skill_steps is for methods that take skills, and ours takes none"),
         (["wall", "--set", "seed=5000000000"], "seed = 5000000000: Input should be less than"),
         (
             ["wall", "--set", "run.total_env_steps=200"],

@@ -10,6 +10,7 @@ from service.base.parsing import parse_yaml
 from service.config import WorkspaceConfig, WorldConfig, dump_config, load_config
 from service.config.robot import RobotConfig
 from service.config.self_play import SelfPlayConfig
+from service.runs.resuming import changed_settings
 from tests.methods.trials import small_trial
 from tests.runs.runs import assert_one_line
 
@@ -113,7 +114,7 @@ def test_overrides_beat_the_file_and_the_last_one_wins(tmp_path):
         ("sed=1", ["unknown key 'sed'", "game, generator, learner, method, name, policy, run, seed, world"]),
         ("game.bob_step=1", ["unknown key 'game.bob_step'", "did you mean 'bob_steps'"]),
         ("clip=1", ["did you mean learner.abc.clip or learner.alice.clip or learner.bob.clip"]),
-        ("skill_steps=1", ["it is a key of method=ours"]),
+        ("reward_margin_m=1", ["it is a key of method=ours"]),
         ("world.workspace.width_m=1", ["unknown key 'world.workspace.width_m'", "length_x_m, length_y_m"]),
         ("world.object={shape: sphere, size_m: [0.05], w: 1}", ["'world.object.w'; known there: color, mesh, shape"]),
         ("world.obstacles=[{shape: sphere, size_m: [0.05], w: 1}]", ["'world.obstacles.0.w'; known there: color"]),
@@ -229,6 +230,15 @@ def test_self_imitation_of_turns_that_no_reward_reaches_is_refused():
         load_config(None, how)
     assert len(str(error.value)) < 500  # not the whole configuration
     load_config(None, [*how, "game.alice_novelty_reward=5"])
+
+
+def test_a_run_of_before_may_say_that_a_skill_is_held_for_one_step():
+    config, directory = small_trial("lsd"), Path("run")
+    assert small_trial("lsd", skill_steps=1) == config
+    saved = config.model_dump(mode="json")
+    assert changed_settings({**saved, "skill_steps": 1}, config, directory) == {}
+    with pytest.raises(ConfigError, match="unknown key 'skill_steps'"):
+        small_trial("lsd", skill_steps=5)
 
 
 def test_a_task_that_goes_on_stays_in_its_world_unless_another_is_named():

@@ -102,7 +102,7 @@ def test_it_is_trained_killed_and_resumed(file, tmp_path, monkeypatch):
             "'game'; known there: code, method, name, run, seed, step_size, world",
         ),
         ("mine.py:Mine", "sac.gamma", "it is a key of method=ours"),
-        ("self-play", "skill_steps", "it is a key of method=ours"),
+        ("self-play", "reward_margin_m", "it is a key of method=ours"),
         ("self-play", "distillation.batch_size", "it is a key of method=distillation"),
         ("skills", "game.num_goals", "it is a key of method=self-play"),
         ("skills", "policy.bob", "it is a key of method=self-play and distillation"),

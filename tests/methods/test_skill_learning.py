@@ -24,8 +24,6 @@ OBJECT = POSITIONS["object"]
 class PointMasses:
     """Points in a plane that an action moves; the reward sees where they are."""
 
-    steps_per_action = 1
-
     def __init__(self, method):
         self._rng, self._method = np.random.default_rng(0), method
         self.at, self.elapsed = np.zeros((NUM, 2), np.float32), 0

@@ -1,4 +1,4 @@
-"""Frozen skills downstream: a skill held for some steps, the same in learning and in evaluation, and bad input."""
+"""Frozen skills downstream: a skill set at each step, the same in learning and in evaluation, and bad input."""
 
 import dataclasses
 
@@ -15,6 +15,7 @@ from service.methods.task import TaskLearning
 from service.methods.task_check import check_fits
 from service.methods.task_worlds import SkillTaskWorlds, TaskWorlds
 from service.policies.frozen_skills import ZeroShotPolicy
+from service.registry.loading import learned_policy
 from service.registry.publishing import publish
 from service.registry.registry import Registry
 from tests.methods.skill_sets import CONFIG, SIZE, WORLD, made, parameters
@@ -32,69 +33,38 @@ def env(length=LENGTH):
     return TabletopVectorEnv(NUM, WORLD, task="push", max_episode_steps=length, num_threads=1)
 
 
-@pytest.mark.parametrize("hold", [1, 4, 3])
-def test_a_held_skill_is_so_many_steps_of_the_frozen_policy(skills, hold):
-    """Where 3 does not divide an episode of 8, its last skill is cut short; the next episode is seen later."""
-    held, plain = SkillTaskWorlds(env(), 3, skills.skills, hold), TaskWorlds(env(), 3)
+def test_a_step_is_one_of_the_frozen_policy_by_the_skill_that_is_set(skills):
+    ours, plain = SkillTaskWorlds(env(), 3, skills.skills), TaskWorlds(env(), 3)
     rng = np.random.default_rng(0)
-    for _ in range(12 // hold):
+    for _ in range(12):
         actions = rng.uniform(-1.0, 1.0, (NUM, SIZE)).astype(np.float32)
-        start = plain.previous, plain.positions, plain.goal
-        columns, ended = held.step(actions)
-        reward, over, last = np.zeros(NUM), np.zeros(NUM, dtype=bool), None
-        for _ in range(hold):
-            step, _ = plain.step(skills.skills.actions(plain.previous, plain.positions, np.float32(1.5) * actions))
-            if not over.any():
-                last = step
-                reward += step["reward"][:, 0]
-            over |= plain.env.rules.elapsed == 0
-        for name, expected in zip(("previous", "positions", "goal"), start, strict=True):
-            np.testing.assert_array_equal(columns[name], expected)
-        np.testing.assert_array_equal(columns["before"], last["positions"])
-        np.testing.assert_array_equal(columns["following"], last["following"])
-        np.testing.assert_array_equal(columns["reward"][:, 0], reward)
-        np.testing.assert_array_equal(columns["action"], actions)
+        found, ended = ours.step(actions)
+        step, over = plain.step(skills.skills.actions(plain.previous, plain.positions, np.float32(1.5) * actions))
+        for name in ("previous", "positions", "following", "goal", "reward"):
+            np.testing.assert_array_equal(found[name], step[name])
+        np.testing.assert_array_equal(found["action"], actions)
         np.testing.assert_array_equal(ended, over)
-        np.testing.assert_array_equal(held.inputs(), plain.inputs())
-    assert held.finished == plain.finished
-    held.close()
+        np.testing.assert_array_equal(ours.inputs(), plain.inputs())
+    assert ours.finished == plain.finished
+    ours.close()
     plain.close()
 
 
-def test_updates_and_horizon_are_counted_in_env_steps(skills):
-    trial = small_trial("lsd", skill_steps=5)
-    loop = TaskLearning(trial, skills).loop
-    assert loop.learner.config.gradient_steps == 5 * trial.sac.gradient_steps
-    assert loop.learner.config.gamma == trial.sac.gamma**5
-    loop.play(trial.run.total_env_steps)
-    assert loop.num_env_steps == trial.run.total_env_steps == 5 * loop.replay.num_added * trial.sac.num_worlds
-    learned = trial.run.total_env_steps - trial.sac.learning_starts
-    assert loop.num_updates == learned // trial.sac.num_worlds * trial.sac.gradient_steps
-    loop.worlds.close()
-
-
-def test_a_learned_policy_holds_its_skills(skills):
-    training = TaskLearning(small_trial("lsd", skill_steps=5), skills)
-    loop = training.loop
-    loop.play(200)  # learned nothing yet: the average is the actor
-    player = training.player()
-    worlds = SkillTaskWorlds(loop.worlds.env, 3, skills.skills, 5)
-    handed, step = [], worlds.env.step
-
-    def handing(actions):
-        handed.append((worlds.positions, worlds.goal, actions))
-        return step(actions)
-
-    worlds.env.step = handing
-    for _ in range(3):
-        with torch.no_grad():
-            actions = torch.tanh(loop.learner.actor(torch.from_numpy(worlds.inputs()))[0]).numpy()
-        worlds.step(actions)
-    assert len(handed) == 15
-    for positions, goal, expected in handed:
-        acted = player.act_deterministic(np.concatenate((positions, goal), axis=1))
+@pytest.mark.parametrize("hold", [1, 5])
+def test_a_learned_policy_holds_its_skills_as_long_as_it_was_published_to(skills, hold):
+    training = TaskLearning(small_trial("lsd"), skills)
+    training.loop.play(200)  # learned nothing yet: the average is the actor
+    actor, worlds = training.loop.learner.actor, training.loop.worlds
+    player = learned_policy(training.parameters(), skills, skills.config, hold)
+    for step in range(3 * hold):
+        if step % hold == 0:
+            with torch.no_grad():
+                actions = torch.tanh(actor(torch.from_numpy(worlds.inputs()))[0]).numpy()
+        expected = skills.skills.actions(worlds.previous, worlds.positions, skills.skills.from_action(actions))
+        acted = player.act_deterministic(np.concatenate((worlds.positions, worlds.goal), axis=1))
         np.testing.assert_allclose(acted, expected, rtol=0, atol=1e-5)
-    worlds.close()
+        worlds.step(actions)
+    training.close()
 
 
 def test_skills_of_actions_by_hand():

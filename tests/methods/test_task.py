@@ -346,8 +346,6 @@ def test_hindsight_fades_out_with_the_run(champion):
         ({"world": {"friction": 0.5}}, "a task is learned in the world of its primitives; leave out world"),
         ({"primitives": "nothing@1"}, "nothing"),
         ({"method": "lsd"}, r"the method LSD skills needs skills, and panda-cube@.* has none: name some"),
-        ({"method": "lsd", "skill_steps": 51}, "skill_steps 51: an episode has 50 steps"),
-        ({"skill_steps": 51}, "skill_steps is for methods that take skills, and ours takes none"),
         ({"reward_margin_m": 0.05}, "reward_margin_m = 0.05"),
     ],
 )
