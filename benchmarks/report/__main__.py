@@ -47,7 +47,7 @@ PAGES = {
     "results/transfer.md": ("transfer", "transfer_champion"),
     "results/README.md": ("throughput",),
     "../README.md": ("seeds", "headline"),
-    "scaling.md": ("box", "model", "two_box", "two_model"),
+    "scaling.md": ("box", "model", "two_box", "two_model", "two_larger"),
     "hardware.md": ("demo",),
     "own_task.md": ("learned",),
     "objects.md": ("two", "tasks"),
@@ -55,8 +55,8 @@ PAGES = {
 """Blocks of every page that are made anew."""
 ABOUT_THE_RECIPE = ("results/pretraining.md", "scaling.md")
 """Pages that show it, and so may call it the shipped recipe only while it is."""
-SEEDS, TWO = "panda-cube", "panda-two-cubes"
-"""Names of the recorded seeds of the recipe, and of the one for two objects."""
+SEEDS, TWO, TWO_LARGER = "panda-cube", "panda-two-cubes", "panda-two-cubes-240"
+"""Names of the recorded seeds of the recipe, of the one for two objects, and of that with larger updates."""
 Results = Mapping[str, Mapping[str, Any]]
 """Recorded files by the name of their benchmark."""
 Blocks = dict[str, list[str]]
@@ -139,7 +139,7 @@ class Report:
             "scaling.md": {
                 "box": [scaling.box_block(found["scaling_box"])],
                 "model": [scaling.model_block(found["scaling_box"], found["time_to_skill"])],
-                **two_cubes_scaling(found),
+                **two_cubes_scaling(found, seeds),
             },
         }
         for page, blocks in made.items():
@@ -221,7 +221,9 @@ def pretraining_blocks(found: Results, seeds: Results, why: Results) -> Blocks:
     return {
         "skill": [text(found["time_to_skill"]) for text in (recipe.recipe_words, time_to_skill.report)],
         "seeds": [text(seeds[SEEDS]) for text in (recipe.recipe_words, pretraining.seeds_block) if SEEDS in seeds],
-        "others": [pretraining.other_seeds(name, study) for name, study in seeds.items() if name not in (SEEDS, TWO)],
+        "others": [
+            pretraining.other_seeds(name, seeds[name]) for name in seeds if name not in (SEEDS, TWO, TWO_LARGER)
+        ],
         "why": [pretraining.why_alice_table(why)],
         "champion": [pretraining.champion_words(seeds[SEEDS])],
     }
@@ -243,15 +245,17 @@ def measured_blocks(found: Results) -> dict[str, Blocks]:
     }
 
 
-def two_cubes_scaling(found: Results) -> Blocks:
-    """Parts of the blocks about what a run with two cubes costs."""
+def two_cubes_scaling(found: Results, seeds: Results) -> Blocks:
+    """Parts of the blocks about what a run with two cubes costs, and what larger updates are worth there."""
+    larger = [pretraining.larger_updates(seeds[TWO], seeds[TWO_LARGER])] if TWO_LARGER in seeds else []
     one, two = (found.get(name) for name in ("scaling_one", "scaling_two"))
     if one is None or two is None:
-        return {"two_box": [], "two_model": []}
+        return {"two_box": [], "two_model": [], "two_larger": larger}
     env_steps = load_config(recipes()[TWO]).run.total_env_steps
     return {
         "two_box": [scaling.box_block(two), scaling.beside(two, one, "one cube")],
         "two_model": [scaling.recipe_block(two, env_steps)],
+        "two_larger": larger,
     }
 
 

@@ -1,4 +1,4 @@
-"""Tables of ``docs/results/pretraining.md``, in Markdown, from recorded runs."""
+"""Tables of ``docs/results/pretraining.md`` and ``pretraining-v1.md``, in Markdown, from recorded runs."""
 
 from __future__ import annotations
 
@@ -83,6 +83,11 @@ def _judged(evaluations: Records) -> list[str]:
 
 def seeds_block(study: Mapping[str, Any]) -> str:
     """What ``benchmarks.seeds`` recorded: a row for each seed, and how many there are of what is asked for."""
+    rates = ", ".join(f"{percent(rate)} of {kind}" for kind, rate in _asked(study).items())
+    return f"{_seeds_table(study)}\n\nAt least {rates} goals: {_how_many(study)} env steps."
+
+
+def _seeds_table(study: Mapping[str, Any]) -> str:
     at = sorted({row["asked"] for run in study["runs"] for row in run["measured"]})
     kinds = [kind for kind in KINDS if kind in study["runs"][0]["measured"][0]]
     names = ", ".join("*Larger*" if kind == "larger" else kind for kind in kinds)
@@ -96,8 +101,7 @@ def seeds_block(study: Mapping[str, Any]) -> str:
         rows.append(
             (str(run["seed"]), *cells, *(judge(run["curve"]) for judge in judged.values()), percent(fmean(lifts)))
         )
-    rates = ", ".join(f"{percent(rate)} of {kind}" for kind, rate in _asked(study).items())
-    return f"{table(head, rows)}\n\nAt least {rates} goals: {_how_many(study)} env steps."
+    return table(head, rows)
 
 
 def _asked(study: Mapping[str, Any]) -> dict[str, float]:
@@ -130,6 +134,24 @@ def other_seeds(name: str, study: Mapping[str, Any]) -> str:
     commits = ", ".join(sorted({commit(run["git_commit"]) for run in study["runs"]}))
     when = ", ".join(sorted({run["machine"]["time"][:10] for run in study["runs"]}))
     return f"`{name}`, {commits}, {when}:\n\n{seeds_block(study)}"
+
+
+def larger_updates(study: Mapping[str, Any], larger: Mapping[str, Any]) -> str:
+    """Seeds of a recipe that were also run with more worlds: both, with the worlds of an update.
+
+    Args:
+        study: recorded seeds of the recipe.
+        larger: of the same with another ``game.num_worlds``.
+    """
+    both = {each["settings"]["recipe"]["game"]["num_worlds"]: each["runs"] for each in (study, larger)}
+    rows = [
+        {**run, "seed": f"{run['seed']}, {num_worlds} worlds"}
+        for again in larger["runs"]
+        for num_worlds, runs in sorted(both.items())
+        for run in runs
+        if run["seed"] == again["seed"]
+    ]
+    return _seeds_table({"runs": rows})
 
 
 def why_alice_table(studies: Mapping[str, Mapping[str, Any]]) -> str:

@@ -201,9 +201,8 @@ def shown(array: Array) -> Array:
 def place_of(function: object) -> tuple[str, str]:
     """The file of a function, also of a partial one, and ``FILE.py:LINE``; its name where Python has no more."""
     function = getattr(function, "func", function)
-    code = getattr(function, "__code__", None)
-    if code is None and (called := vars(type(function)).get("__call__")) is not None:  # an object that can be called
-        code = getattr(called, "__code__", None)
+    called = getattr(type(function), "__call__", None)  # noqa: B004 - of an object that can be called
+    code = getattr(function, "__code__", None) or getattr(called, "__code__", None)
     return (code.co_filename, f"{code.co_filename}:{code.co_firstlineno}") if code else (repr(function),) * 2
 
 

@@ -49,7 +49,7 @@ class Rules:
             raise CodeError(self.task.closed)
         if isinstance(self.task.goals, str):
             try:
-                check_goals(self.task.goals, worlds.config)
+                check_goals(self.task.goals, worlds.config, success_distance_m)
             except TandemError as error:
                 raise (CodeError(f"{self.task.name}: {error}") if self.task.code else error) from None
         if self.task.starts is not None and worlds.config.num_objects > 1 and "object_size" in worlds.bank.drawn:

@@ -306,7 +306,7 @@ def draw_goals(
     Raises:
         TandemError: goals off the table in a world with a fixture, or no room for any.
     """
-    check_goals(kind, config)
+    check_goals(kind, config, success_distance_m)
 
     def draw(places: Places) -> StateArray:
         if config.fixture == "wall":
@@ -351,7 +351,7 @@ def _one_moved(
     raise ConfigError("world.objects: no room for a goal beside the others: make world.workspace larger")
 
 
-def check_goals(kind: GoalKind, config: WorldConfig) -> None:
+def check_goals(kind: GoalKind, config: WorldConfig, success_distance_m: float = SUCCESS_DISTANCE_M) -> None:
     """Refuse goals that a world cannot have.
 
     Raises:
@@ -364,7 +364,7 @@ def check_goals(kind: GoalKind, config: WorldConfig) -> None:
     if config.fixture != "none" and kind != "table":
         where = {"wall": "behind it", "box": "in it"}[config.fixture]
         raise TandemError(f"goals = {kind!r} with a {config.fixture}: its goals lie {where}; choose table")
-    lowest_m = max(config.rest_heights_m) + SUCCESS_DISTANCE_M
+    lowest_m = max(config.rest_heights_m) + success_distance_m
     if kind == "air" and lowest_m >= config.workspace.height_m:
         raise TandemError(
             f"goals = 'air' in a workspace {config.workspace.height_m:g} m high: they begin at {lowest_m:g} m; "

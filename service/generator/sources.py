@@ -42,7 +42,7 @@ class Known:
         Raises:
             TandemError: ``one``, or a kind that the world cannot have.
         """
-        check_goals(kind, self.world)
+        check_goals(kind, self.world, self.success_distance_m)
         if kind == "one":
             raise TandemError("goals = 'one' depend on where the objects are; choose mixed, and let the others stay")
         return sample_goals(kind, rng, num, self.world, self.success_distance_m)

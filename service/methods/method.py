@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 import time
 from abc import ABC, abstractmethod
@@ -176,11 +177,12 @@ class Method(ABC):
 
         Raises:
             ValueError: fewer than 0.
+            TypeError: no whole number.
         """
         if num_env_steps < 0:
             raise ValueError(f"count of {num_env_steps} env steps; give 0 or more")
         self.iteration += 1
-        self.num_env_steps += int(num_env_steps)  # NumPy's cannot be saved
+        self.num_env_steps += operator.index(num_env_steps)  # of NumPy's, which cannot be saved, a plain one
         return {"iteration": self.iteration, "env_steps": self.num_env_steps}
 
 

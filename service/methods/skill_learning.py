@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from contextlib import nullcontext
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 
 from service.base.types import Array, Arrays, BoolArray, FloatArray
-from service.base.user_code import naming_errors_of, origin_of
+from service.base.user_code import naming_unexpected, origin_of
 from service.config import WorkspaceConfig
 from service.config.skills import SkillDiscoveryConfig, SkillsConfig
 from service.envs.gym.vector import TabletopVectorEnv
@@ -118,8 +117,7 @@ class IntrinsicBatches:
 
     def __init__(self, reward: IntrinsicReward, config: SkillsConfig, see: Callable[[Columns], Seen]) -> None:
         self.reward, self._config, self._see = reward, config, see
-        origin = origin_of(type(reward))
-        self._naming_errors = nullcontext if origin is None else functools.partial(naming_errors_of, origin)
+        self._origin = origin_of(type(reward))
         self.losses: list[float] = []
         """Of the reward's network, since this list was last cleared."""
 
@@ -129,12 +127,12 @@ class IntrinsicBatches:
         for _ in range(self._config.gradient_steps):
             rows = replay.read(replay.draw(self._config.batch_size, rng, newest=newest))
             steps = _tensors(self._see(rows), rows["skill"], jumps=False)
-            with self._naming_errors():
+            with naming_unexpected(self._origin):
                 self.losses.append(self.reward.learn(*steps))
         rows = replay.read(replay.draw(size, rng))
         seen = self._see(rows)
         steps = _tensors(seen, rows["skill"], jumps=self.reward.pays_jumps)
-        with self._naming_errors():
+        with naming_unexpected(self._origin):
             paid: FloatArray = self.reward.rewards(*steps).numpy()
         weights = rows["skill"] if self.reward.pays_features else None
         return Batch(seen.inputs, rows["action"], paid, seen.next_inputs, weights)

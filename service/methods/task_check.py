@@ -74,7 +74,7 @@ def check_task(task: Task, world: WorldConfig, *, relabels: bool = False) -> Non
             return rules.solved(goal)
 
         if relabels and task.is_own:  # without the memory
-            rules.reward(rules.view(goal))  # what fails with it, too, is no matter of hindsight
+            rules.reward(rules.view(goal))  # an error that also comes with the memory is not of hindsight
             try:
                 rules.reward(View.of_rows(rules.view(goal).rows(), each_object(goal.astype(np.float32))))
             except CodeError as error:

@@ -149,8 +149,10 @@ class Registry:
         """
         name, target = names.split_reference(reference)
         number = target if isinstance(target, int) else self._read_alias(name, target)
-        if number is None or not self._manifest_path(Version(name, number)).exists():
-            raise UnknownVersionError(self._describe_missing(name, target))
+        path = None if number is None else self._manifest_path(Version(name, number))
+        with os_errors("read", self.root / "models" / name):
+            if number is None or path is None or not path.exists():
+                raise UnknownVersionError(self._describe_missing(name, target))
         return Version(name, number)
 
     def manifest(self, reference: str) -> Manifest:
@@ -179,6 +181,15 @@ class Registry:
             RegistryError: something else than a directory is at the registry's path.
         """
         return [name for name in self._all_names() if self._has_versions(name)]
+
+    def ready(self) -> None:
+        """Find out whether names can be read.
+
+        Raises:
+            RegistryError: something else than a directory is at the registry's path.
+            OSError: they cannot.
+        """
+        self._all_names()
 
     def _all_names(self) -> list[str]:
         """Every name that has a directory, sorted."""

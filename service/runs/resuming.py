@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+from pydantic import ValidationError
 
 from service.base.errors import CheckpointError, ConfigError
 from service.config import Config, load_config
@@ -59,8 +62,9 @@ def changed_settings(saved: dict[str, Any], config: Config, directory: Path) -> 
     Raises:
         CheckpointError: a setting that may not change.
     """
-    was = type(config).model_validate(saved)  # it may have keys that are gone
-    changed = _differences(was.model_dump(mode="json"), config)
+    with suppress(ValidationError):  # a key that is gone may be read still; else it is one of the differences
+        saved = type(config).model_validate(saved).model_dump(mode="json")
+    changed = _differences(saved, config)
     for key, (old, new) in changed.items():
         if not f"{key}=".startswith(config.resumable):
             raise CheckpointError(

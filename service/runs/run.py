@@ -207,10 +207,10 @@ class Run:
         """Check an iteration, which began at so many env steps; all of it if the method is a user's."""
         self._num_idle = self._num_idle + 1 if self.num_env_steps <= before else 0
         if self._num_idle >= MAX_IDLE:
-            remedy = (
-                "say how many with self.count(NUMBER)" if self._origin else "is there a goal that Bob can be given?"
-            )
-            raise CodeError(f"{self._origin or 'the run'}: {MAX_IDLE} iterations made no env steps; {remedy}")
+            words = f"{MAX_IDLE} iterations made no env steps"
+            if self._origin is None:
+                raise ConfigError(f"{words}: generator.goal_source gave no goal that Bob can play")
+            raise CodeError(f"{self._origin}: {words}; say how many with self.count(NUMBER)")
         if self._origin is None:
             return
         self._expect(isinstance(ended, Iteration), "step", ended, "an Iteration or None")

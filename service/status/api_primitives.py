@@ -130,7 +130,7 @@ class Shelf:
     def summary(self, name: str) -> PrimitiveSummary:
         """What there is of a name that has a version."""
         origins, aliases = self._origins(name), dict[str, tuple[Origin, int]]()
-        with suppress(StorageError, OSError):  # one must not hide the other names; the name's own page says so
+        with suppress(StorageError, OSError):  # a damaged alias must not hide the name; the name's own page says so
             aliases = self._aliases(name)
         return PrimitiveSummary(
             name=name,
@@ -163,11 +163,11 @@ class Shelf:
 
     def _aliases(self, name: str) -> dict[str, tuple[Origin, int]]:
         """Where the version of each alias is, and its number."""
-        return {
-            alias: (origin, number)
-            for origin, registry in self.registries.items()
-            for alias, number in registry.aliases(name).items()
-        }
+        found = dict[str, tuple[Origin, int]]()
+        for origin, registry in self.registries.items():
+            with suppress(PermissionError):
+                found |= {alias: (origin, number) for alias, number in registry.aliases(name).items()}
+        return found
 
     def _describe(self, origin: Origin, version: Version, aliases: list[str]) -> VersionSummary:
         registry = self.registries[origin]

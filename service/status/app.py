@@ -131,7 +131,7 @@ def _service_router(runs: RunReader, registry: Registry, telemetry: Telemetry, t
         """503 while something the service needs is unavailable."""
         try:
             runs.ready()
-            registry.names()
+            registry.ready()
         except (TandemError, OSError) as error:
             trusted = request.scope.get(TRUSTED, False)
             raise ProblemError(

@@ -8,6 +8,7 @@ import pytest
 from benchmarks import seeds
 from benchmarks.report.pretraining import (
     dips,
+    larger_updates,
     other_seeds,
     seeds_block,
     seeds_words,
@@ -99,6 +100,22 @@ def test_the_table_of_seeds_by_hand():
     first, _, head, *_ = other_seeds("panda-cube-paper", {"runs": runs}).splitlines()
     assert first == "`panda-cube-paper`, commit `fb14796`, 2026-11-27, 2026-11-28:"
     assert head.startswith("| seed | 2 M: mixed")
+
+
+def test_larger_updates_are_beside_the_same_seeds_by_hand():
+    def study(num_worlds, rates):
+        runs = [
+            {"seed": seed, "curve": [{"lifted": 0.5}], "measured": [{"asked": 2e6, "one": {"last": rate}}]}
+            for seed, rate in rates.items()
+        ]
+        return {"runs": runs, "settings": {"recipe": {"game": {"num_worlds": num_worlds}}}}
+
+    assert larger_updates(study(120, {1: 0.2, 2: 0.3}), study(240, {2: 0.4})).splitlines() == [
+        "| seed | 2 M: one | Alice lifts |",
+        "| --- | --- | --- |",
+        "| 2, 120 worlds | 30.0 | 50 % |",
+        "| 2, 240 worlds | 40.0 | 50 % |",
+    ]
 
 
 def test_what_alice_is_for_by_hand():

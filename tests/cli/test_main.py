@@ -91,7 +91,9 @@ def test_pretrain_films_rounds_where_pictures_can_be_drawn(trained):
     video = trained.run / "rounds.mp4"
     try:
         SceneRenderer(tiny_config().world, 64, 48).close()
-    except TandemError:
+    except TandemError as error:
+        if not str(error).startswith("cannot draw"):
+            raise
         assert "rounds.mp4" not in trained.result.stdout
         pytest.skip("videos need OpenGL: EGL or OSMesa, apt-get install libegl1")
     assert str(video) in trained.result.stdout

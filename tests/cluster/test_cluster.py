@@ -46,7 +46,7 @@ class Mine(GoalSource):
 
 @pytest.fixture(scope="module", autouse=True)
 def cluster():
-    """A Ray of our own with four logical cores, for all tests of this file. Its workers inherit two variables."""
+    """A Ray of our own with four logical cores, for all tests of this file. Its workers inherit three variables."""
     with ExitStack() as stack:
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("OPENBLAS_NUM_THREADS", "7")

@@ -15,6 +15,7 @@ from service.envs.batch import WorldBatch
 from service.envs.gym.tabletop import TabletopEnv
 from service.envs.gym.vector import TabletopVectorEnv
 from service.envs.rules import Rules
+from service.envs.sampling import check_goals
 from service.envs.task import Task, View, num_in_rows
 from service.envs.tasks import PAPERS, TASKS, find_task
 from tests.runs.runs import assert_one_line
@@ -238,15 +239,19 @@ def test_an_object_that_can_be_called_is_named_by_its_file(worlds):
         def __call__(self, s):
             return s.gone
 
+    class PaidMore(Paid): ...
+
     with pytest.raises(CodeError, match=r"test_own_task.py:\d+: AttributeError"):
-        Rules(Task("Mine", reward=Paid()), worlds).reward(Rules(Task("Mine"), worlds).view(GOAL))
+        Rules(Task("Mine", reward=PaidMore()), worlds).reward(Rules(Task("Mine"), worlds).view(GOAL))
 
 
 def test_goals_in_the_air_of_a_workspace_without_room_for_them():
     low = {"workspace": {"height_m": 0.07}}
+    world = Task("Low", world=low).world_from(WORLD)
+    check_goals("air", world, 0.02)  # what counts as reached is less
     with pytest.raises(TandemError, match=r"goals = 'air' in a workspace 0.07 m high: they begin at 0.075 m; choose"):
         evaluate(
-            IdlePolicy(), Task("Low", world=low).world_from(WORLD), "air", num_episodes=1, num_steps=1,
+            IdlePolicy(), world, "air", num_episodes=1, num_steps=1,
             success_distance_m=0.05, seed=0,
         )  # fmt: skip
 

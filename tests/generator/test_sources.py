@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from service.base.errors import TandemError
+from service.base.errors import ConfigError, TandemError
 from service.config import load_config, parse_config
 from service.generator.generator import TaskGenerator
 from service.generator.sources import CheckedSource
 from service.generator.validity import Verdict
 from tests.generator.test_generator import FREE, ONE_GAME, choose, everywhere, only_starts, record
-from tests.runs.runs import assert_one_line
+from tests.runs.runs import TREE, assert_one_line, play
 
 CODE = """
 import numpy as np
@@ -23,6 +23,16 @@ class Corner(GoalSource):
     def weights(self, known, goal, start, learnability):
         assert goal.shape == start.shape == (*learnability.shape, 1, 3)
         return (goal[:, 0, 0] > 0.08) * (learnability > 0.0)
+"""
+RUNS_OUT = """
+from service.generator.sources import GoalSource
+
+class Corner(GoalSource):
+    num_calls = 0
+
+    def goals(self, known, rng):
+        Corner.num_calls += 1
+        return known.random(rng, 0 if Corner.num_calls > 9 else 400)
 """
 SETTINGS = ("generator.goal_source=corner.py", "generator.replay_invalid=true", "generator.replay_from_reset=true")
 
@@ -105,6 +115,19 @@ def test_no_goal_is_inside_a_fixture(file):
     ]
     assert 0 < len(kept[1]) < len(kept[0])
     assert kept[0][:, 0].max() > 0.12 > 0.08 > kept[1][:, 0].max()  # 2 cm of the block, 2.5 cm of the cube
+
+
+def test_a_run_that_gets_no_goal_any_more_ends(file, tmp_path, monkeypatch):
+    monkeypatch.setattr("service.runs.run.MAX_IDLE", 5)
+    file.write_text(RUNS_OUT)
+    tree = {
+        "game": TREE["game"] | {"alice_plays": False},
+        "generator": {"goal_source": "corner.py", "replay_invalid": True},
+    }
+    config = parse_config(TREE | tree | {"run": TREE["run"] | {"total_env_steps": 10**9}}, where="a test")
+    with pytest.raises(ConfigError) as error:
+        play(tmp_path / "run", config.begin("registry", None))
+    assert_one_line(error.value, "5 iterations made no env steps: generator.goal_source gave no goal that Bob can ")
 
 
 @pytest.mark.parametrize("kind", ["tabel", "one"])

@@ -132,6 +132,7 @@ def test_a_key_of_one_method_is_unknown_to_another(file, method, key, said):
             "mine.py: measure gave a NoneType; give metrics, numbers",
         ),
         ("count(10)", "count(-1)", "mine.py:15: ValueError: count of -1 env steps; give 0 or more"),
+        ("count(10)", "count(0.5)", "mine.py:15: TypeError: 'float' object cannot be interpreted as an integer"),
         ("return Climb(self)", "return 3", "mine.py: build gave a int; give a Method"),
         ("super().__init__()", "pass", "mine.py: build gave a Climb; give one whose __init__ calls super().__init__()"),
         ("self.count(10) | {", "{", "the metrics of an Iteration lack iteration and env_steps"),

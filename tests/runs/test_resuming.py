@@ -8,9 +8,10 @@ import yaml
 
 from service.base.errors import CheckpointError, ConfigError, StorageError, TandemError
 from service.base.lock import claim_epoch
+from service.config import load_config
 from service.registry.registry import Registry
 from service.runs import train as training
-from service.runs.resuming import resumed_config
+from service.runs.resuming import changed_settings, resumed_config
 from service.runs.train import open_run
 from service.store.run_directory import RunDirectory
 from service.store.run_history import read_history
@@ -101,6 +102,14 @@ def test_a_checkpoint_of_another_seed_is_refused(run):
     with pytest.raises(CheckpointError) as error:
         go_on(run)
     assert_one_line(error.value, run, "seed is 3 in config.yaml", "was made with 0", "put that back")
+
+
+def test_a_key_of_a_checkpoint_that_is_gone_is_named(run):
+    config = load_config(run / "config.yaml")
+    saved = config.model_dump(mode="json") | {"gone": 5}
+    with pytest.raises(CheckpointError) as error:
+        changed_settings(saved, config, run)
+    assert_one_line(error.value, run, "gone is None in config.yaml", "was made with 5")
 
 
 def test_a_configuration_that_may_change_is_said_and_noted(run, caplog):

@@ -160,15 +160,23 @@ def test_versions_of_a_name(client, home):
 
 
 def test_a_name_of_another_user_does_not_hide_the_bundled_one(registry, monkeypatch):
-    versions = Registry.versions
+    for verb in ("versions", "aliases"):
+        monkeypatch.setattr(Registry, verb, refusing(getattr(Registry, verb), registry.root))
+    summary = Shelf(registry).summary("panda-cube")
+    assert summary.origins == ("bundled",)
+    assert "champion" in summary.aliases
+    assert len(Shelf(registry).versions("panda-cube", limit=1)) == 1
 
-    def refused(place, name):  # root may read everything
-        if place.root == registry.root:
+
+def refusing(asked, root):
+    """As a directory of another user does; root may read everything."""
+
+    def refused(registry, name):
+        if registry.root == root:
             raise PermissionError
-        return versions(place, name)
+        return asked(registry, name)
 
-    monkeypatch.setattr(Registry, "versions", refused)
-    assert Shelf(registry).summary("panda-cube").origins == ("bundled",)
+    return refused
 
 
 def test_a_damaged_manifest_does_not_hide_the_others(client, home):
