@@ -119,8 +119,10 @@ class DemonstrationHistory:
         self._nothing = Demonstrations(*numbers)
 
     def append(self, demonstrations: Iterable[Demonstrations]) -> None:
-        """Add one iteration; the oldest one goes if there are too many."""
-        self._iterations.append(self._join(demonstrations))
+        """Add one iteration, without steps that are not finite; the oldest one goes if there are too many."""
+        new = self._join(demonstrations)
+        finite = np.isfinite(new.observation).all(1) & np.isfinite(new.action).all(1)
+        self._iterations.append(Demonstrations(new.observation[finite], new.action[finite]))
 
     def joined(self) -> Demonstrations:
         """Join all that is kept, oldest first."""

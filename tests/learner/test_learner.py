@@ -236,6 +236,16 @@ def test_demonstrations_of_the_last_iterations_are_kept():
     assert counts == [12.0, 17.0, 5.0, 0.0]
 
 
+def test_demonstrations_that_are_not_finite_are_left_out():
+    learner = Learner(make_config())
+    rollout = make_rollout(learner, 0)
+    rollout.demonstrations.action[3, 1] = np.nan
+    learner.ingest(rollout)
+    metrics = learner.update()
+    assert metrics["learner/num_demonstrations"] == 11.0
+    assert metrics["learner/non_finite_steps"] == 0.0
+
+
 def test_demonstrations_alone_are_cloned():
     learner = Learner(make_config(bob={"num_epochs": 5}, abc={"weight": 1.0}))
     metrics = updated(learner, 0, bob=nobody_learns(make_rollout(learner, 0).bob))
