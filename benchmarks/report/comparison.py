@@ -175,7 +175,7 @@ def _cell(seeds: Seeds, paper: float) -> str:
 def headline_table(results: Sequence[Result]) -> str:
     """Success at the last step: composing, Bob alone, and the best method of other kinds on each task.
 
-    Every cell has its number of seeds in brackets.
+    Every cell has its number of seeds in brackets. A kind that was not measured on every task is left out.
     """
     rates = {place: rate_of(seeds) for place, seeds in by_method_and_task(results).items()}
     known = {method for method, _ in rates}
@@ -187,7 +187,8 @@ def headline_table(results: Sequence[Result]) -> str:
     }
     rows: list[Row] = []
     for title, names in groups.items():
-        if found := [name for name in names if name in known]:
+        found = [name for name in names if name in known]
+        if all(any((name, task) in rates for name in found) for task in PAPERS):
             words = f"{title}, the best of up to {len(found)} methods on each task"
             if len(found) == 1:
                 words = title if len(names) == 1 else f"{title}: {TASK_METHODS[found[0]].title}"
