@@ -42,7 +42,7 @@ ARMS = {
     ),
     "uniform-alone": Arm(
         "goals from the whole workspace, without her",
-        (_UNIFORM, "game.alice_plays=false", "generator.past_opponent_fraction=0"),
+        (_UNIFORM, "game.alice_plays=false"),
         round(BOB_SHARE * ENV_STEPS),
     ),
     "no-cloning": Arm("the recipe, and Bob clones nothing", ("learner.abc.weight=0",)),

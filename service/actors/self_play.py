@@ -351,20 +351,17 @@ class SelfPlay:
 
     def state(self) -> Arrays:
         """Everything later rounds depend on, except the random generator, which its owner saves."""
-        own = {
+        return {
             "worlds": self.worlds.states.copy(),
             "round_index": self._round_index.copy(),
             "sequence": np.array(self._sequence),
-            "num_broken": np.array(self.worlds.num_diverged),
         }
-        return own
 
     def load_state(self, state: Arrays) -> None:
         """Continue exactly where ``state`` was taken."""
         self.worlds.restore(np.asarray(state["worlds"], dtype=np.float64))
         self._round_index = np.asarray(state["round_index"], dtype=np.int64).copy()
         self._sequence = int(state["sequence"])
-        self.worlds.num_diverged = int(state["num_broken"])
 
 
 def _act(

@@ -102,7 +102,7 @@ class GeneratorConfig(FrozenModel):
     """The task generator: which goals and opponents a round uses, and when the run is over."""
 
     past_opponent_fraction: float = Field(
-        0.2, ge=0.0, le=0.5, description="share of worlds, each way (OpenAI 2021: 20 %)"
+        0.2, ge=0.0, le=0.5, description="share of worlds, each way (OpenAI 2021: 20 %); none without Alice"
     )
     opponent_pool_size: int = Field(5, ge=1, description="past players that are kept")
     opponent_interval: int = Field(10, ge=1, description="iterations between two snapshots of the players")

@@ -96,7 +96,6 @@ class WorldBatch:
         self.states: StateArray = np.tile(self._fresh_state, (num_worlds, 1))
         """(N, S)."""
         self._see()
-        self.num_diverged = 0
         self.diverged: list[tuple[StateArray, FloatArray]] = []
         """(last finite state, action) of every world whose physics diverged; the reader clears the list."""
 
@@ -268,7 +267,6 @@ class WorldBatch:
         if not finite.all():
             after[~finite] = start[~finite]
             diverged[index] = ~finite
-            self.num_diverged += int((~finite).sum())
             self.diverged += [(start[row].copy(), actions[row].copy()) for row in np.flatnonzero(~finite)]
         self.states[index] = after
         self._see()

@@ -56,7 +56,6 @@ class Distillation(Method):
         self._rng = np.random.default_rng(config.seed)
         self._cells = GoalCells(config.world)
         self._tries, self._solved = (np.zeros(len(self._cells), dtype=np.int64) for _ in range(2))
-        self._num_broken = 0
         self._teacher: Arrays = {}
         self._observed = ObservedConfig()
         self._worlds: DistillationWorlds | None = None
@@ -80,10 +79,9 @@ class Distillation(Method):
             progress = self.num_env_steps / self._config.run.total_env_steps
             learned = self._distiller.learn(played.lesson, progress, self._rng)
         metrics = self.count(played.num_env_steps)
-        self._num_broken += len(played.diverged)
         self._count_goals(played.goal, played.solved)
         metrics |= {f"learner/{name}": value for name, value in learned.items()}
-        metrics["world/num_broken"] = float(self._num_broken)
+        metrics["world/num_broken"] = float(len(played.diverged))
         if len(played.solved):
             metrics["bob/success_rate"] = float(played.solved.mean())
         goals: StateArray = np.column_stack((played.start, played.goal, played.solved)).astype(np.float64)
@@ -129,14 +127,13 @@ class Distillation(Method):
             "bob": dict(self.parameters()),  # for readers without torch: evaluate, render, coverage
             "rng": self._rng.bit_generator.state,
             "teacher_observed": self._observed.model_dump(mode="json"),
-            "num_broken": self._num_broken,
         }
 
     def load_state(self, state: State) -> None:
         """Continue, bit for bit, where ``state`` gave these."""
         self._distiller.load_state(state["distiller"])
         self._tries, self._solved = (np.array(state["cells"][name]) for name in ("tries", "solved"))
-        self._rng.bit_generator.state, self._num_broken = state["rng"], int(state["num_broken"])
+        self._rng.bit_generator.state = state["rng"]
         self._meet_teacher(dict(state["teacher"]), ObservedConfig.model_validate(state["teacher_observed"]))
 
     def _count_goals(self, goal: StateArray, solved: np.ndarray) -> None:

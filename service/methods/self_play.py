@@ -220,7 +220,7 @@ def _round_metrics(rounds: Sequence[RoundSummary]) -> Metrics:
     shares = num_worlds / num_worlds.sum()
     means = {name: float(shares @ [each.metrics[name] for each in rounds]) for name in rounds[0].metrics}
     return means | {
-        "world/num_broken": float(sum(each.num_diverged for each in rounds)),
+        "world/num_broken": float(sum(len(each.diverged) for each in rounds)),
         "time/play_s": float(np.mean([each.play_s for each in rounds])),
     }
 

@@ -36,10 +36,7 @@ class RoundSummary:
     id: tuple[int, int, int]
     num_env_steps: int
     num_worlds: int
-    num_diverged: int
-    """Worlds whose physics diverged, in this incarnation."""
     diverged: Diverged
-    """Those of this round."""
     play_s: float
     metrics: Metrics
 
@@ -84,7 +81,9 @@ class RolloutWorker:
         config = self._config.generator
         self.game.block_grippers(float(snapshot.success_rate))
         starts = self.game.round_starts()
-        plan = opponents.plan(self.game.worlds.num_worlds, config.past_opponent_fraction, self.rng)
+        # A past Bob judges the goals of Alice, and learns nothing: without her there is none.
+        fraction = config.past_opponent_fraction if self._config.game.alice_plays else 0.0
+        plan = opponents.plan(self.game.worlds.num_worlds, fraction, self.rng)
         rollout = self.game.play_round(self._players(weights, opponents), plan, snapshot)
         goals = summarize(
             rollout.records,
@@ -100,7 +99,6 @@ class RolloutWorker:
             id=rollout.id,
             num_env_steps=rollout.num_env_steps,
             num_worlds=self._config.game.num_worlds,
-            num_diverged=self.game.worlds.num_diverged,
             diverged=rollout.diverged,
             play_s=time.perf_counter() - start,
             metrics=rollout.metrics,

@@ -110,7 +110,7 @@ RUN_METRICS: tuple[RunMetric, ...] = (
     _of_record("learn_seconds", "time/learn_s", "Seconds of learning in one iteration"),
     _of_record("non_finite_steps", "learner/non_finite_steps", "Gradient steps skipped because they were not finite"),
     _of_record("rollbacks", "learner/rollbacks", "Players reset to their state before the update"),
-    _of_record("broken_worlds", "world/num_broken", "Worlds whose physics diverged so far"),
+    _of_record("broken_worlds", "world/num_broken", "Worlds whose physics diverged"),
     _of_record("goal_cells", "generator/num_cells_seen", "Cells of the grid with a valid goal of an object so far"),
 )  # fmt: skip
 """Metrics with one sample for each run."""

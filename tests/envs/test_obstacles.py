@@ -122,7 +122,7 @@ def test_one_that_falls_off_the_table_lies_on_the_floor_and_is_seen_at_the_bound
         put(worlds, obstacle_1=(1.5, 0.0, 0.1))
         for _ in range(50):
             worlds.step(STAY)
-        assert worlds.num_diverged == 0
+        assert worlds.diverged == []
         np.testing.assert_allclose(worlds.obstacle_positions[0, 0], (1.5, 0.0, FLOOR_Z_M + 0.025), atol=2e-3)
         seen = worlds.positions()[0, worlds.observed.positions["obstacle_1"]]
         np.testing.assert_allclose(seen, (SEEN_WITHIN_M, 0.0, FLOOR_Z_M + 0.025), atol=2e-3)

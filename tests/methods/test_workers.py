@@ -84,6 +84,18 @@ def test_a_round_is_a_function_of_what_it_is_given(learned, make_actor):
     assert records.bob_past.any()
 
 
+def test_without_alice_no_world_has_a_past_player(learned, make_actor):
+    weights, generator = learned
+    tree = TREE | {
+        "game": TREE["game"] | {"alice_plays": False},
+        "generator": TREE["generator"] | {"goal_source": "uniform", "replay_invalid": True},
+    }
+    alone = make_actor(config=parse_config(tree, where="a test"))
+    rollout, _, _ = alone.play(weights, generator.generator.snapshot(), generator.generator.opponents)
+    assert not rollout.records.alice_past.any()
+    assert not rollout.records.bob_past.any()
+
+
 def test_the_generator_hears_of_every_game_that_began(learned, make_actor, config):
     weights, generator = learned
     given, actor = (generator.generator.snapshot(), generator.generator.opponents), make_actor(1)
