@@ -3,8 +3,7 @@
     python -m benchmarks.reproduce --list
     python -m benchmarks.reproduce --parallel 2
 
-That is the table of downstream tasks, skill discovery and tasks of two cubes, some seventy hours of one core, by
-today's version of what learns.
+That is the table of downstream tasks, skill discovery and tasks of two cubes, by today's version of what learns.
 Each is one or more of the commands that anybody can type, and this prints them. What was stopped goes on from its run
 directory. Pictures and pages are made from the files afterwards, by ``python -m benchmarks.report``.
 """

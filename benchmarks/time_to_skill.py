@@ -94,7 +94,7 @@ def words(result: Mapping[str, Any]) -> str:
     if math.isfinite(median_s := statistics.median(found)):
         times += f", {median_s / 60.0:.1f} at the median"
     cores = result["runs"][0]["machine"]["num_cpus"]
-    return f"{len(there)} of {len(found)} solve {100 * SHARE:.0f} % after {times}, on {cores} quiet cores."
+    return f"{len(there)} of {len(found)} solve {100 * SHARE:.0f} % after {times}, on {cores} cores."
 
 
 @one_line_errors

@@ -17,7 +17,7 @@ from typing import Any
 
 from benchmarks import scaling, time_to_skill, transfer
 from benchmarks.measuring import one_line_errors
-from benchmarks.report import comparison, figures, measured, pretraining, recipe, skills
+from benchmarks.report import comparison, figures, measured, pretraining, recipe, sentences, skills
 from benchmarks.report.downstream import check_versions, draw_table, each_seed, methods_table, write_results
 from benchmarks.report.results import Result, by_method_and_task, read_all
 from benchmarks.reproduce import MANY_UPDATES, RESULTS, TWO_CUBES, experiments
@@ -121,14 +121,15 @@ class Report:
             scaling.words(found["scaling_box"]),
             pretraining.why_alice_words(why),
         )
+        headline = self.headline(trials)
         made = measured_blocks(found) | {
             "results/pretraining.md": pretraining_blocks(found, seeds, why),
             "results/pretraining-v1.md": self.earlier_blocks(runs, found),
             "results/skills.md": self.skills_blocks(recorded_skills),
             "results/comparison.md": self.comparison_blocks(trials),
-            "downstream.md": {"headline": [comparison.headline_table(trials)]},
+            "downstream.md": {"headline": [headline]},
             "../README.md": {
-                "headline": [comparison.headline_table(trials)],
+                "headline": [headline],
                 "seeds": ["\n".join(filter(None, judged))],
             },
             "own_task.md": {"learned": [measured.own_task_table(read_all(self._results / "own_task"))]},
@@ -179,6 +180,21 @@ class Report:
             "throughput": [pretraining.throughput_words(found["throughput"])],
         }
 
+    def headline(self, trials: Sequence[Result]) -> str:
+        """The summary of the tasks, and what there is to say of it."""
+        longer, more_updates = (self._trials(f"longer{suffix}") for suffix in ("", f"_{MANY_UPDATES}"))
+        words = (
+            comparison.headline_table(trials),
+            sentences.ahead_words(trials, comparison.OWN, "push"),
+            sentences.without_hindsight_words(trials),
+            sentences.longer_words(longer, more_updates),
+        )
+        return "\n".join(filter(None, words))
+
+    def _trials(self, name: str) -> list[Result]:
+        """Recorded trials beside the table's, such as ``longer`` ones."""
+        return list(read_all(self._results / RESULTS.name / f"downstream_{name}").values())
+
     def skills_blocks(self, runs: Sequence[Run]) -> Blocks:
         """Parts of the blocks about skills."""
         stages = self.show("Random skills at three stages of training", "skills", figures.draw_skills, runs)
@@ -191,10 +207,7 @@ class Report:
 
     def comparison_blocks(self, trials: Sequence[Result]) -> Blocks:
         """Parts of the blocks that compare with the paper."""
-        as_paper, longer, more_updates = (
-            list(read_all(self._results / RESULTS.name / f"downstream_{name}").values())
-            for name in ("paper", "longer", f"longer_{MANY_UPDATES}")
-        )
+        as_paper, longer, more_updates = map(self._trials, ("paper", "longer", f"longer_{MANY_UPDATES}"))
         check_versions([*trials, *as_paper, *longer, *more_updates])
         blocks = {
             "rows": [comparison.comparison_table(trials, as_paper)],

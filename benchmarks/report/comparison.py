@@ -22,7 +22,7 @@ PAPER_EPISODES = 48
 GOOD = 0.9
 """Success of which longer trials say when they reach it."""
 _PAPER_RECIPE = next(iter(PAPER_PRIMITIVES.values())).partition("@")[0]
-_OWN = "ours-her"
+OWN = "ours-her"
 """The composing method of the summary."""
 _PAPER_SEEDS = 3
 """Of every rate of the paper, as its table says."""
@@ -99,7 +99,7 @@ def missing_table(planned: Sequence[Experiment]) -> str:
         if done[title] < len(group)
     ]
     words = f"{sum(done.values())} of {len(planned)} experiments are recorded."
-    left = f"The others take some {_hours(planned):.0f} hours of one core."
+    left = f"By the plan the others take {_hours(planned):.0f} hours of one core."
     heads = ("", "recorded", "missing", "hours of one core")
     return f"{words} {left} Missing:\n\n{table(heads, rows)}" if rows else words
 
@@ -180,7 +180,7 @@ def headline_table(results: Sequence[Result]) -> str:
     rates = {place: rate_of(seeds) for place, seeds in by_method_and_task(results).items()}
     known = {method for method, _ in rates}
     groups = {
-        "composing frozen primitives, with hindsight": [_OWN],
+        "composing frozen primitives, with hindsight": [OWN],
         "Bob alone, no downstream step": ["asp-only"],
         "learned from nothing": learning(None),
         "skills of other methods, without hindsight": learning("skills"),

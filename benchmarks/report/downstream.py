@@ -72,7 +72,7 @@ def write_page(results: Sequence[Result]) -> str:
         "## Success at the last step\n",
         "Mean of the seeds; in brackets their number. The interval is one of 95 % for the mean over seeds (Student's "
         "t). A single seed has Wilson's over its episodes instead, marked by a star: it says how far the share may be "
-        "off because episodes were few, not how far another seed would differ. Below each method, the paper's figures: "
+        "off because episodes were few, not how far another seed would differ. Below the paper's methods, its figures: "
         "they are of another world, likely a harder one "
         "([cell by cell](comparison.md), and what differs). Tasks and methods may have had different numbers of env "
         "steps: they are below.\n",
@@ -197,8 +197,9 @@ def _efficiency(of: Mapping[tuple[str, str], Seeds]) -> Sequence[str]:
     return (
         "\n## How soon\n",
         f"Thousands of env steps until a method reaches {FINAL_SHARE:.0%} of its own final success, as the mean of two "
-        "evaluations in a row. Below each, in italics: until the first method that learns from nothing is as good. In "
-        "brackets: how many such methods were run. Means over seeds.\n",
+        "evaluations in a row, mean of the seeds; empty where not every seed gets there. Below each, in italics: until "
+        "the first method that learns from nothing comes to the same success, with all of its seeds; `>` where none "
+        "does. In brackets: how many such methods were run.\n",
         _markdown(rows),
     )
 

@@ -11,7 +11,7 @@ from benchmarks.record_run import ASKED, ASKED_RATES, ASKED_STEPS, TASKS
 from benchmarks.report.markdown import Row, commit, duration, millions, percent
 from benchmarks.run_files import RANDOM, STAGES, Records, Run, binned, mean_share, steps_until, unthin
 from benchmarks.seeds import KINDS, NUM_EPISODES
-from benchmarks.why_alice import ARMS
+from benchmarks.why_alice import ARMS, ENV_STEPS
 from service.base.markdown import table
 from service.config.self_play import SelfPlayConfig
 from service.methods.task_evaluation import rate_of
@@ -181,16 +181,18 @@ def why_alice_words(studies: Mapping[str, Mapping[str, Any]]) -> str:
     """
     if not studies.keys() >= ARMS.keys():
         return ""
-    mean = {
-        name: percent(fmean(run["measured"][-1]["mixed"]["last"] for run in study["runs"]))
-        for name, study in studies.items()
+    rates = {
+        name: [100 * run["measured"][-1]["mixed"]["last"] for run in study["runs"]] for name, study in studies.items()
     }
+    mean = {name: f"{fmean(each):.0f} %" for name, each in rates.items()}
+    random, num_seeds = rates["uniform-new-alice"], len(rates["recipe"])
     return (
         f"[Why Alice](docs/results/pretraining.md#why-alice)? Bob solves {mean['recipe']} of random goals; "
         f"{mean['no-cloning']} if he clones none of her turns, "
         f"{mean['no-difficulty']} if his failures do not pay her."
-        f"\nWith random goals of the whole workspace added: {mean['uniform']} with Alice, "
-        f"{mean['uniform-new-alice']} with an Alice who does not learn, {mean['uniform-alone']} without Alice."
+        f"\nWith goals of the whole workspace added: {mean['uniform']} with Alice, {mean['uniform-new-alice']} "
+        f"({min(random):.0f} to {max(random):.0f} by seed) beside an Alice who does not learn, "
+        f"{mean['uniform-alone']} without her ({num_seeds} seeds, {millions(ENV_STEPS)} env steps)."
     )
 
 

@@ -64,7 +64,7 @@ def test_what_is_missing_by_hand(tmp_path):
     some += [planned("ours", "wall", 0, done=False), planned("ours", "push", 0, done=True)]
     some += [planned("idle", "inair", 0, done=True), planned("controls", "uniform", 2, done=False)]
     assert missing_table(some).splitlines() == [
-        "3 of 12 experiments are recorded. The others take some 4 hours of one core. Missing:",
+        "3 of 12 experiments are recorded. By the plan the others take 4 hours of one core. Missing:",
         "",
         "|  | recorded | missing | hours of one core |",
         "| --- | --- | --- | --- |",

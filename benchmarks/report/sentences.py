@@ -1,0 +1,90 @@
+"""Sentences below the summary of the six tasks, for the README and ``docs/downstream.md``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from benchmarks.report.comparison import GOOD, learning
+from benchmarks.report.downstream import Seeds, mean_until
+from benchmarks.report.markdown import millions, percent
+from benchmarks.report.results import Result, by_method_and_task
+from benchmarks.reproduce import MANY_UPDATES
+from service.base.types import FloatArray
+from service.config.task_methods import TASK_METHODS
+from service.envs.tasks import PAPERS, find_task
+from service.methods.task_evaluation import rate_of
+
+LEVEL = 0.05
+"""Two means that differ by less are level: single points of a curve scatter by about as much."""
+
+
+def ahead_words(results: Sequence[Result], composing: str, task: str) -> str:
+    """Until when composing is ahead of the best that learns from nothing, and what is between them at the end."""
+    of = by_method_and_task(results)
+    rivals = [of[name, task] for name in learning(None) if (name, task) in of]
+    if not rivals or (composing, task) not in of:
+        return ""
+    steps = [point["env_steps"] for point in of[composing, task][0]["curve"]]
+    own, best = _means(of[composing, task], steps), np.max([_means(seeds, steps) for seeds in rivals], axis=0)
+    ahead = np.flatnonzero(own - best >= LEVEL)
+    until = f"until {round(steps[ahead[-1]], -3):,} env steps" if len(ahead) else "nowhere"
+    last = round(100 * (rate_of(of[composing, task]).mean - max(rate_of(seeds).mean for seeds in rivals)))
+    points = f"{abs(last)} point{'s' * (abs(last) > 1)}"
+    end = f"it is {points} {'ahead' if last > 0 else 'behind'}" if last else "they are level"
+    return (
+        f"On *{find_task(task).title}* composing is ahead of learning from nothing by {100 * LEVEL:.0f} points or more "
+        f"{until}; at the end {end}."
+    )
+
+
+def longer_words(longer: Sequence[Result], more_updates: Sequence[Result]) -> str:
+    """Where and when learning from nothing becomes good in longer trials, and with more updates: a line for each."""
+    words = []
+    for budget, trials in (("", longer), (f"with {MANY_UPDATES} updates for 64 env steps instead of 8 ", more_updates)):
+        if places := _good_places(trials):
+            words.append(f"{budget}{places}")
+    if not words:
+        return ""
+    most, said = max(each["env_steps"] for each in (*longer, *more_updates)), ";\n".join(words)
+    return f"In trials of {millions(most)} env steps learning from nothing reaches {percent(GOOD)} {said}."
+
+
+def without_hindsight_words(results: Sequence[Result]) -> str:
+    """How far learning from nothing without hindsight is above doing nothing, at most."""
+    of = by_method_and_task(results)
+    without = [name for name in learning(None) if TASK_METHODS[name].her_ratio is None]
+    tasks = [task for task in PAPERS if ("idle", task) in of]
+    pairs = [(of[name, task], of["idle", task]) for task in tasks for name in without if (name, task) in of]
+    if not pairs:
+        return ""
+    most = max(rate_of(seeds).mean - rate_of(idle).mean for seeds, idle in pairs)
+    return (
+        f"Without hindsight learning from nothing is at most {100 * most:.1f} points above doing nothing "
+        f"{_seeds_words([seeds for seeds, _ in pairs])}."
+    )
+
+
+def _good_places(trials: Sequence[Result]) -> str:
+    """Such as ``on *InAir* after 0.5 M env steps (1 seed)``: of the first method that gets there."""
+    of = by_method_and_task(trials)
+    places = []
+    for task in PAPERS:
+        found = {name: mean_until(of[name, task], GOOD) for name in learning(None) if (name, task) in of}
+        soon = [each for each in found.values() if each is not None]
+        if soon:
+            places.append(f"on *{find_task(task).title}* after {millions(min(soon))}")
+    return f"{', '.join(places)} env steps {_seeds_words(list(of.values()))}" if places else ""
+
+
+def _means(seeds: Seeds, steps: Sequence[int]) -> FloatArray:
+    """Success at these env steps, mean of the seeds."""
+    curves = [{point["env_steps"]: point["success_last"] for point in each["curve"]} for each in seeds]
+    return np.array([np.mean([curve[step] for curve in curves]) for step in steps], dtype=np.float32)
+
+
+def _seeds_words(places: Sequence[Seeds]) -> str:
+    """Such as ``(1 seed)``, or ``(1 to 3 seeds)`` where these methods and tasks had unequal numbers."""
+    counts = sorted({len(seeds) for seeds in places})
+    return f"({' to '.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'})"
