@@ -136,11 +136,12 @@ def evaluate(
 
     Raises:
         ValueError: ``num_episodes`` below 1.
-        TandemError: no such task or goals, or a task of another number of objects.
+        TandemError: no such task or goals, a task of another number of objects, or nothing that ``load`` gave.
     """
     from service.actors import evaluation
     from service.methods.task_evaluation import FINAL_SEED
 
+    trained = _loaded(trained)
     if num_episodes < 1:
         raise ValueError(f"num_episodes = {num_episodes}; give at least 1")
     name = str(task) if isinstance(task, Path) else task
@@ -150,6 +151,16 @@ def evaluate(
         on.player(), on.world, on.on_goals(goals), num_episodes=num_episodes,
         num_steps=on.num_steps, success_distance_m=on.success_distance_m, seed=first_seed,
     )  # fmt: skip
+
+
+def _loaded(given: object) -> Trained:
+    """What ``load`` gave, or a reminder to call it."""
+    from service.base.errors import TandemError
+    from service.registry.loading import Trained
+
+    if isinstance(given, Trained):
+        return given
+    raise TandemError(f"{given!r}, a {type(given).__name__}: give what tandem_skills.load returns")
 
 
 def _registry() -> str:
@@ -173,4 +184,5 @@ def make_env(
     """
     from service.envs.gym.vector import TabletopVectorEnv
 
-    return TabletopVectorEnv(num_envs, None if trained is None else trained.config.world, task=task)
+    world = None if trained is None else _loaded(trained).config.world
+    return TabletopVectorEnv(num_envs, world, task=task)

@@ -5,10 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 
 import tandem_skills
+from service.base.errors import TandemError
 
 ROOT = Path(__file__).parents[1]
 
@@ -51,8 +53,23 @@ def test_a_policy_is_evaluated_in_an_environment_and_as_the_command_does(champio
     observation, _ = envs.reset(seed=0)
     assert observation["observation"].shape == (2, 11)
     assert envs.config.gripper == "blocked"
+    joined = np.concatenate([observation["observation"], observation["desired_goal"]], axis=1)
+    np.testing.assert_array_equal(champion.act_deterministic(observation), champion.act_deterministic(joined))
     np.testing.assert_array_equal(envs.step(np.zeros((2, 4), np.float32))[1] >= 0.0, [True, True])
     envs.close()
+
+
+def test_a_reference_is_not_what_it_loads():
+    said = "'panda-cube@champion', a str: give what tandem_skills.load returns"
+    world = gymnasium.make("tandem/Tabletop-v1")
+    for given in (
+        lambda: tandem_skills.evaluate("panda-cube@champion"),
+        lambda: tandem_skills.make_env("push", "panda-cube@champion"),
+        lambda: tandem_skills.ComposePrimitives(world, "panda-cube@champion"),
+    ):
+        with pytest.raises(TandemError, match=said):
+            given()
+    world.close()
 
 
 @pytest.mark.usefixtures("default_signals", "no_artifacts")

@@ -16,7 +16,8 @@ from service.base.markdown import table
 from service.config.self_play import SelfPlayConfig
 from service.methods.task_evaluation import rate_of
 from service.registry.bundled import BUNDLED
-from service.registry.loading import load, parameters_digest
+from service.registry.digest import parameters_digest
+from service.registry.loading import load
 
 NUM_BINS = 10
 """Equal parts of a run's env steps; rates are those of the last, distances and heights also those of the first."""

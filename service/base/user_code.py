@@ -30,6 +30,8 @@ PRIVATE = "tandem_user_"
 """Begins the names of the modules that such texts make."""
 MAX_BYTES = 40_000
 """Of a file: it is in the configuration of a run, and in every checkpoint."""
+ALIKE = 0.8
+"""Similarity of two names, by ``difflib``, of which one is likely the other one misspelt."""
 
 
 class CodeError(ConfigError):
@@ -224,6 +226,24 @@ def find_class(named: str, texts: Texts, base: type) -> Any:
         return isinstance(found, type) and issubclass(found, base) and not found.__module__.startswith("service.")
 
     return find(reference, texts, is_own, f"class that derives from {base.__name__}")
+
+
+def check_members(kind: type, base: type) -> None:
+    """Refuse a class of a user's that misspells a member of its base: the base's own would be used in its place.
+
+    Raises:
+        CodeError: it has a public member that is spelt almost like one of the base.
+    """
+    from difflib import get_close_matches
+
+    known = [name for name in dir(base) if not name.startswith("_")]
+    own = {name for each in kind.__mro__ if origin_of(each) is not None for name in vars(each)}
+    for name in sorted(own - {*known}):
+        if not name.startswith("_") and (like := get_close_matches(name, known, n=1, cutoff=ALIKE)):
+            raise CodeError(
+                f"{origin_of(kind)}: {kind.__name__}.{name} is no member of {base.__name__}; did you mean "
+                f"{like[0]!r}? The name of a helper of your own begins with an underscore"
+            )
 
 
 def recorded(reference: str, texts: Texts) -> Texts:

@@ -311,7 +311,8 @@ def parse_points(option: str, text: str, world: WorldConfig, expected: str) -> S
         expected: words for what can be typed, up to its form.
 
     Raises:
-        TandemError: no points; or one outside of the workspace, inside a fixture, or of objects inside each other.
+        TandemError: no points; or one outside of the workspace, inside the table or a fixture, or of objects inside
+            each other.
     """
     from service.envs.sampling import inside_each_other, inside_fixtures
 
@@ -326,6 +327,12 @@ def parse_points(option: str, text: str, world: WorldConfig, expected: str) -> S
     for point in points[(each_object(points) != np.clip(each_object(points), low, high)).any(axis=(1, 2))]:
         raise TandemError(
             f"{option}: {in_metres(point)} is outside of the workspace, ({in_metres(low)}) to ({in_metres(high)}) m"
+        )
+    for point in points[(each_object(points)[:, :, 2] < np.round(world.rest_heights_m, 6)).any(axis=1)]:
+        lowest = " and ".join(f"{height_m:g}" for height_m in world.rest_heights_m)
+        raise TandemError(
+            f"{option}: {in_metres(point)} is inside the table: a goal is for the object's centre, which lies {lowest} "
+            "m high there"
         )
     for point in points[inside_fixtures(points, world)]:
         raise TandemError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -260,7 +261,10 @@ def train_and_tell(
             tracked = stack.enter_context(closing(Trackers(trackers, run_id_of(directory.path), tree)))
             progress = stack.enter_context(closing(Progress(shown())))
 
+            iterations = list[float]()
+
             def tell(metrics: dict[str, float]) -> Ending | None:
+                iterations.append(metrics["iteration"])
                 progress.show(metrics, config.run.total_env_steps)
                 tracked.log(metrics)
                 return until(metrics)
@@ -275,6 +279,9 @@ def train_and_tell(
     except InterruptError as interrupt:
         raise stopped("stopped at once", interrupt.number, hint, begun=directory.exists) from None
     typer.echo(f"\n{done.reason} after {done.num_env_steps:,} env steps, {done.iteration} iterations")
+    if resume and done.reason == "finished" and not iterations:
+        budget = f"{config.run.total_env_steps:,}"
+        typer.echo(f"nothing was left to learn: run.total_env_steps is {budget}; raise it by --set to go on")
     typer.echo(done.timing)
     if done.signal is not None:
         rest = "" if done.reason == "interrupted" else ", but not evaluated, published and drawn to the end"
@@ -288,4 +295,6 @@ def train_and_tell(
         typer.echo(f"{name:<12} {file}")
     if done.version is not None:
         typer.echo(f"{config.makes:<12} {done.version} in {registry}")
+    if done.metrics and config.makes == "orchestrator":
+        typer.echo(f"try it:      tandem play {shlex.quote(str(directory.path))}")
     return done

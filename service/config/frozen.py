@@ -25,6 +25,10 @@ class FrozenModel(BaseModel):
         return value
 
 
+_UNITS = {"_m": "metres", "_kg": "kg", "_s": "seconds", "_rad": "radians"}
+"""By the ends of keys."""
+_BOUNDS = ("less_than", "greater_than")
+"""Begin the types of errors about a number that is out of range."""
 _WANTED = {
     "tuple_type": "give a list, such as [A, B]",
     "model_type": "give a group of keys, such as {KEY: VALUE}",
@@ -51,6 +55,8 @@ def first_error(error: ValidationError) -> str:
     words = _WANTED.get(first["type"], first["msg"].removeprefix("Value error, "))  # which our own checks have
     if first["type"] == "literal_error" and {BUILT_IN, NAMED} & {*first["loc"]}:
         words += ", or describe one: {KEY: VALUE}"
+    if first["type"].startswith(_BOUNDS):
+        words += next((f" ({unit})" for end, unit in _UNITS.items() if key.rstrip(".0123456789").endswith(end)), "")
     if not key and first["type"] == "value_error":  # our own checks of what belongs together name the keys
         return str(words)
     return f"{key or 'the top level'}{found}: {words}"

@@ -98,7 +98,7 @@ class MeshConfig(FrozenModel):
         extent = upper - lower
         if not _fits(extent):
             sizes = " x ".join(f"{each:.3g}" for each in extent)
-            fitting = [self.scale * each for each in (1e-3, 1e3) if _fits(extent * each)]
+            fitting = [self.scale * each for each in (1e-3, 1e-2, 1e3) if _fits(extent * each)]
             hint = f"; with scale: {fitting[0]:g} it would fit" if fitting else ""
             raise ConfigError(
                 f"mesh {pieces[0]} is {sizes} m large, and objects have {LEAST_M:g} to {MOST_M:g} m: is its file in "
@@ -132,7 +132,9 @@ def _read_piece(name: str, scale: float) -> tuple[StateArray, float]:
         try:
             model = spec.compile()
         except ValueError as error:
-            raise ConfigError(f"mesh {name}: MuJoCo cannot use it: {' '.join(str(error).split())}") from None
+            raise ConfigError(
+                f"mesh {name}: MuJoCo cannot use it: {' '.join(str(error).split())}; give an STL or OBJ file"
+            ) from None
         volumes.append(float(model.body("piece").mass[0]) / 1000.0)
     _check_closed(name, model.mesh_face)
     exact, convex = volumes

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
 from service.config.frozen import DESCRIBED, NAMED, FrozenModel
@@ -45,8 +46,10 @@ class ObjectConfig(FrozenModel):
         expected, what = _NUM_SIZES[self.shape]
         if len(self.size_m) != expected:
             raise ValueError(f"size_m of a {self.shape} has {expected} numbers, {what}; got {len(self.size_m)}")
-        if (self.shape == "mesh") != (self.mesh is not None):
-            raise ValueError("mesh, which names files as pieces, belongs to shape: mesh and to no other")
+        if self.shape == "mesh" and self.mesh is None:
+            raise ValueError("shape: mesh needs its files, mesh: {pieces: [FILE]}")
+        if self.shape != "mesh" and self.mesh is not None:
+            raise ValueError(f"mesh belongs to shape: mesh, and this is a {self.shape}: leave one of them out")
         if self.shape == "capsule" and self.size_m[1] <= self.size_m[0]:
             raise ValueError(f"size_m of a capsule: its length {self.size_m[1]:g} must exceed its diameter")
         return self
@@ -124,6 +127,11 @@ def _read_mesh(value: Any) -> Any:
     if mesh.sha256:
         return value
     read, extent_m = mesh.measured()
+    if (given := value.get("size_m")) is not None and not np.allclose(given, extent_m, rtol=1e-3):
+        raise ValueError(
+            f"size_m = {given} of a mesh is read from its files, which have {[round(each, 4) for each in extent_m]}: "
+            "leave it out; mesh.scale makes it larger or smaller"
+        )
     return {**value, "mesh": read, "size_m": extent_m}
 
 

@@ -415,5 +415,12 @@ class WorldBatch:
             if contact.dist < -_TOUCHING_M and fixed and not any(name.startswith(_MOVED) for name in names):
                 raise ConfigError(
                     f"at its start, {self.config.start_height_m:g} m above the middle of the workspace, the gripper is "
-                    f"inside {fixed[0]}: raise world.start_height_m, or put the fixture elsewhere"
+                    f"{-contact.dist:.3f} m deep inside {_fixture(fixed[0])}: raise world.start_height_m, or put the "
+                    "fixture elsewhere"
                 )
+
+
+def _fixture(geom: str) -> str:
+    """The words for the fixture that a part of the model belongs to."""
+    name = geom.removeprefix(FIXTURE_PREFIX).partition("-")[0]
+    return f"world.fixtures[{name}]" if name.isdigit() else f"the {name}"

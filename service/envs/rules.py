@@ -14,6 +14,7 @@ from service.config.run import SUCCESS_DISTANCE_M
 from service.envs.batch import WorldBatch
 from service.envs.observations import distances, each_object
 from service.envs.sampling import (
+    TOUCHES_M,
     GoalKind,
     check_goals,
     draw_goals,
@@ -58,6 +59,9 @@ class Rules:
                 "others: leave that out"
             )
         self._worlds, self._near_m = worlds, success_distance_m
+        flatter_m = [(body.extent_m[2] - min(body.extent_m)) / 2 for body in worlds.config.bodies]
+        self._lowest_m = worlds.bank.rest_heights_m.min(axis=0) - flatter_m
+        """(K,) heights of the objects' centres as they lie on their lowest side on the lowest table."""
         self.elapsed: NDArray[np.int64] = np.zeros(worlds.num_worlds, dtype=np.int64)
         """(N,) steps of the episode so far."""
         self.memory: StateArray = np.zeros((worlds.num_worlds, self.task.memory_size))
@@ -114,18 +118,27 @@ class Rules:
             asked = view.of(wrong)
             found = self._asked(name, asked.objects.place.shape, asked, rng)
             place[wrong] = found.reshape(len(found), -1)
-            wrong = self.out_of_reach(place) | inside_fixtures(place, config) | inside_each_other(place, config)
-            wrong |= self.inside_things(place, worlds, bottom=name == "starts")
+            reasons = {
+                "out of reach, or inside the table": self.out_of_reach(place),
+                "inside a fixture": inside_fixtures(place, config),
+                "inside each other": inside_each_other(place, config),
+                "inside an obstacle or the box": self.inside_things(place, worlds, bottom=name == "starts"),
+            }
             if name == "starts":
                 # It may know heights as they are in its world, or as the configuration has them.
                 rest_m = np.minimum(config.rest_heights_m, batch.rest_heights[worlds])
-                wrong |= inside_gripper_or_table(place, config, batch.gripper_at_start, rest_m)
+                reasons["inside the gripper or the table"] = inside_gripper_or_table(
+                    place, config, batch.gripper_at_start, rest_m
+                )
+            wrong = np.any([*reasons.values()], axis=0)
             if not wrong.any():
                 return place
-        where, one = place_of(getattr(self.task, name))[1], each_object(place[wrong][:1])[0]
+        where, first = place_of(getattr(self.task, name))[1], int(wrong.argmax())
+        last = " and ".join(f"({in_metres(each)})" for each in each_object(place[first : first + 1])[0])
+        why = next(words for words, found in reasons.items() if found[first])
         raise CodeError(
             f"{where}: {name} gave no place that is within reach and clear, in {wrong.sum()} of {len(wrong)} worlds, "
-            f"{_MAX_DRAWS} times: at last {' and '.join(f'({in_metres(each)})' for each in one)} m; choose others"
+            f"{_MAX_DRAWS} times: at last {last} m, {why}; choose others, in metres and for the objects' centres"
         )
 
     def advance(self, goal: StateArray) -> None:
@@ -172,9 +185,14 @@ class Rules:
         return in_box | inside_obstacles(place, there.obstacles, batch.config)
 
     def out_of_reach(self, goal: StateArray) -> BoolArray:
-        """(N,) whether the arm brings an object not as near to its place of (N, 3 K) goals as counts."""
-        near: BoolArray = np.all(distances(self.nearest(goal), goal) <= self._near_m, axis=1)
-        return ~near  # what is no number is out of reach, too
+        """(N,) whether the arm brings an object not as near to its place of (N, 3 K) goals as counts.
+
+        So it is inside of the table, too: the place of an object is its centre.
+        """
+        near = np.all(distances(self.nearest(goal), goal) <= self._near_m, axis=1)
+        above = np.all(each_object(goal)[:, :, 2] >= self._lowest_m - TOUCHES_M, axis=1)
+        out: BoolArray = ~(near & above)  # what is no number is out of reach, too
+        return out
 
     def _asked(self, name: str, shape: tuple[int, ...], *given: Any, truth: bool = False) -> Array:
         function = getattr(self.task, name)

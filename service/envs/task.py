@@ -233,11 +233,11 @@ def _found_again(name: str, texts: Mapping[str, str], changes: Mapping[str, Any]
 class _NotGiven(NDArrayOperatorsMixin):
     """Stands for a part of a view that is not known."""
 
-    def __init__(self, part: str) -> None:
-        self._part = part
+    def __init__(self, part: str, hint: str = "") -> None:
+        self._part, self._hint = part, hint
 
     def _refuse(self, *_: Any, **__: Any) -> Any:
-        raise LookupError(f"{self._part} is not known where a reward is computed again, for another goal")
+        raise LookupError(f"{self._part} is not known where a reward is computed again, for another goal{self._hint}")
 
     __getitem__ = __array__ = __array_ufunc__ = __len__ = __bool__ = _refuse
 
@@ -249,7 +249,8 @@ class _NotGiven(NDArrayOperatorsMixin):
 
 def view_of_places(achieved: Array, desired: Array) -> View:
     """A view of (N, 3 K) places of the objects and (N, 3 K) goals, which knows nothing else."""
+    hint = "; compute_reward knows places and goals alone"
     names = ("velocity", "gripper", "fingers", "contacts", "elapsed", "memory")
-    velocity, gripper, fingers, contacts, *others = (cast("Any", _NotGiven(name)) for name in names)
+    velocity, gripper, fingers, contacts, *others = (cast("Any", _NotGiven(name, hint)) for name in names)
     place, goal = each_object(achieved), each_object(desired)
     return View(Bodies(place, velocity), gripper, fingers, contacts, goal, *others)

@@ -10,9 +10,9 @@ from inspect import getfile
 
 import numpy as np
 
-from service.base.errors import ConfigError, TandemError
+from service.base.errors import ConfigError, TandemError, in_metres
 from service.base.types import Array, BoolArray, StateArray
-from service.base.user_code import CodeError, checked, find_class, naming_errors_of, shown
+from service.base.user_code import CodeError, check_members, checked, find_class, naming_errors_of, shown
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
 from service.envs.observations import each_object
@@ -74,6 +74,7 @@ class CheckedSource:
         self, config: SelfPlayConfig, coverage: float, success_rate: float, near: Callable[[StateArray], BoolArray]
     ) -> None:
         kind: type[GoalSource] = find_class(config.generator.goal_source, config.code, GoalSource)
+        check_members(kind, GoalSource)
         self._origin, self._name, self._near = getfile(kind), kind.__name__, near
         self._known = Known(config.world, config.success_distance_m, coverage, success_rate, self._asked_near)
         with naming_errors_of(self._origin):
@@ -88,9 +89,19 @@ class CheckedSource:
             goal = goal.reshape(-1, num, 3)
         shape = len(np.atleast_1d(goal)), num, 3
         goal = checked(f"{self._origin}: {self._name}.goals", goal, shape)
+        self._first = goal[:1].reshape(-1, 3)
         kept: StateArray = goal[in_workspace(goal, self._known.world.workspace).all(axis=1)].reshape(-1, shape[1] * 3)
         world = self._known.world
         return kept[~(inside_each_other(kept, world) | inside_fixtures(kept, world))]
+
+    @property
+    def left_out(self) -> str:
+        """Words for the first goal that it gave last and the workspace; empty where it gave none."""
+        if not len(self._first):
+            return ""
+        workspace = self._known.world.workspace
+        low, high = in_metres(workspace.lower_m), in_metres(workspace.upper_m)
+        return f"; its first is ({in_metres(self._first[0])}) m, and the workspace ({low}) to ({high}) m"
 
     def _asked_near(self, goal: StateArray) -> BoolArray:
         """``Known.near``, of (M, 3 K) or (M, K, 3) goals."""
@@ -125,7 +136,7 @@ def check_source(config: SelfPlayConfig) -> None:
         ConfigError: it does not run, gives something else, or no goal in the workspace.
     """
     rng = np.random.default_rng(0)
-    found = []
+    found = list[int]()
     for near in (False, True):
         source = CheckedSource(config, 0.0, 0.0, partial(_all, near))
         goal = source.goals(rng)
@@ -135,7 +146,7 @@ def check_source(config: SelfPlayConfig) -> None:
     if not (any(found) if config.game.alice_plays else found[0]):
         raise ConfigError(
             f"generator.goal_source = {config.generator.goal_source!r}: it gives no goal in the workspace "
-            "while nothing is known: let it give some without known.near, such as known.random(rng)"
+            f"while nothing is known{source.left_out}: let it give some without known.near, such as known.random(rng)"
         )
 
 

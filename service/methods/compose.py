@@ -35,10 +35,14 @@ def check_primitives(primitives: NumpyMCPPolicy | Trained) -> NumpyMCPPolicy:
     """Return what can be composed, once its manifest says that it is for this robot and layout.
 
     Raises:
-        TandemError: a monolithic Bob, or primitives of another robot or layout.
+        TandemError: a monolithic Bob, primitives of another robot or layout, or neither.
     """
     if isinstance(primitives, NumpyMCPPolicy):
         return primitives
+    if not isinstance(primitives, Trained):
+        raise TandemError(
+            f"primitives = {primitives!r}, a {type(primitives).__name__}: give what tandem_skills.load returns"
+        )
     check_robot(primitives)
     return primitives.primitives
 

@@ -147,7 +147,7 @@ def begin(config: SkillDiscoveryConfig, registry: Path | str, start_from: Traine
 
 
 def check_reward(config: SkillsConfig, code: Mapping[str, str]) -> IntrinsicReward:
-    """Try a user's reward on a small batch, and what is exported of it.
+    """Try a user's reward on random batches as large as in learning, and what is exported of it.
 
     Raises:
         CodeError: it raises, gives another shape, numbers that are not finite, or a network that cannot be exported.
@@ -155,19 +155,24 @@ def check_reward(config: SkillsConfig, code: Mapping[str, str]) -> IntrinsicRewa
     kind = find_reward(config.method, code)
     origin = getfile(kind)
     random = torch.Generator().manual_seed(0)
-    before, after, skill = (torch.randn(8, size, generator=random) for size in (STATE_SIZE, STATE_SIZE, config.size))
+
+    def drawn(num: int) -> list[torch.Tensor]:
+        return [torch.randn(num, size, generator=random) for size in (STATE_SIZE, STATE_SIZE, config.size)]
+
+    taught, judged = drawn(config.batch_size), drawn(config.sac.batch_size)
     where = f"{origin}: {kind.__name__}"
     with naming_errors_of(origin):
         reward, again = (kind(config, STATE_SIZE, seed) for seed in (0, 1))
-        _check_tensors(where, reward.rewards(before, after, skill), reward.loss(before, after, skill), config, kind)
-        loss, paid = reward.learn(before, after, skill), reward.rewards(before, after, skill).numpy()
+        _check_tensors(where, reward.rewards(*judged), reward.loss(*taught), config, kind)
+        loss, paid = reward.learn(*taught), reward.rewards(*judged).numpy()
         again.load_state(reward.state())
-        resumes = again.learn(before, after, skill) == reward.learn(before, after, skill)
+        resumes = again.learn(*taught) == reward.learn(*taught)
         layers = prepared(np, {f"n.{name}": array for name, array in reward.exported().items()}).get("n", [])
         rows = torch.randn(8, len(layers[0][0]) if layers else STATE_SIZE, generator=random)
         with torch.no_grad():
             found = reward.network(rows).numpy()
-    checked(f"{where}.paid", paid, (8, config.size) if reward.pays_features else (8,))
+    num = config.sac.batch_size
+    checked(f"{where}.paid", paid, (num, config.size) if reward.pays_features else (num,))
     checked(f"{where}.loss", np.array(loss), ())
     if not resumes:
         raise CodeError(f"{where}: goes on otherwise after load_state(state()): tensors() has to have all that changes")

@@ -6,6 +6,7 @@ An iteration is an episode of every world.
 from __future__ import annotations
 
 import functools
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ from service.registry.loading import Trained, learned_policy, load
 
 _RELABELLED_UNTIL = 0.5
 """Progress from which on the share of relabelled goals is its last one (docs/results/log.md, T17)."""
+_logger = logging.getLogger(__name__)
 
 
 class TaskLearning(Method):
@@ -247,6 +249,8 @@ def begin(config: TaskConfig, registry: Path | str, start_from: Trained | None) 
     check_fits(how, found)
     task = find_task(config.task, config.code, config.task_world)
     found.playing(task)  # is refused where it has not as many objects
+    if (num := found.config.world.num_objects) > 1 and not task.world.keys() & {"object", "objects"}:
+        _logger.info("%s is played with %d objects, as %s knows them", task.title, num, found.label)
     check_task(task, found.config.world, relabels=how.her_ratio is not None)
     exact = config.model_copy(
         update={

@@ -32,7 +32,7 @@ def check_fits(method: TaskMethod, trained: Trained) -> None:
     if method.takes == "skills" and trained.kind != "skills":
         name = method.skills or "lsd"
         raise TandemError(
-            f"the method {method.title} needs skills, and {trained.label} has none: name some, such "
+            f"this method acts by skills, and {trained.label} has none: name some, such "
             f"as panda-cube-{name}@latest, which tandem train --method {name} makes"
         )
     if method.takes is not None:
@@ -41,7 +41,9 @@ def check_fits(method: TaskMethod, trained: Trained) -> None:
     if method.composes:
         check_primitives(trained)
     if method.skills is not None and (found := trained.skills.method) != method.skills:
-        raise TandemError(f"{trained.label} holds skills of {found}, this method takes those of {method.skills}")
+        raise TandemError(
+            f"{trained.label} holds skills of {found}, this method takes those of {method.skills}; any-skills takes all"
+        )
 
 
 def check_task(task: Task, world: WorldConfig, *, relabels: bool = False) -> None:

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import copy
 import functools
-import hashlib
 import logging
-import operator
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -22,7 +20,7 @@ import numpy as np
 from service.base.errors import ConfigError, TandemError
 from service.base.parsing import NAME
 from service.base.tensors import digest_of, split_parts
-from service.base.types import Array, FloatArray
+from service.base.types import FloatArray
 from service.base.user_code import changed_since, parse_reference
 from service.config import Config, WorldConfig
 from service.config.run import SUCCESS_DISTANCE_M
@@ -36,6 +34,7 @@ from service.policies.numpy_actor import numpy_actor
 from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy, NumpyPolicy, numpy_bob
 from service.policies.parameters import Parameters, PolicyError
 from service.registry.bundled import BUNDLED, find_version, is_bundled, is_exported
+from service.registry.digest import parameters_digest
 from service.registry.learned import LearnedPolicy
 from service.registry.manifest import Manifest, acting_config
 from service.store.checkpoints import Checkpoint, CheckpointStore, read_checkpoint
@@ -205,14 +204,16 @@ class Trained:
         if begin is not None:
             begin()
 
-    def act_deterministic(self, observation: FloatArray) -> FloatArray:
+    def act_deterministic(self, observation: FloatArray | Mapping[str, FloatArray]) -> FloatArray:
         """Compute (N, 4) actions in [-1, 1] from (N, O) positions and goal, such as (N, 14), metres.
 
-        Bob takes (O,), too.
+        Or from the observation of a Gymnasium environment of Tandem, which has both. Bob takes (O,), too.
 
         Raises:
             PolicyError: another shape; of a policy of a task another N than in the step before, without ``begin``.
         """
+        if isinstance(observation, Mapping):
+            observation = np.concatenate([observation["observation"], observation["desired_goal"]], axis=-1)
         return np.clip(self.policy.act_deterministic(observation), -1.0, 1.0)
 
     def player(self) -> DeterministicPolicy:
@@ -296,6 +297,8 @@ def load(
 ) -> Trained:
     """Load what was trained; see ``service.load``."""
     path, reference = Path(reference), str(reference)
+    if re.search(r"\.py(:|$)", reference) and not path.is_dir():
+        raise TandemError(f"{reference} is code, and what was trained is asked for; name a task by --task {reference}")
     is_place = path.is_dir() or "/" in reference or (path.suffix == ".safetensors" and path.is_file())
     if is_exported(path) or not is_place:
         found = _load_version(reference, registry, primitives, run_task_code=run_task_code)
@@ -472,29 +475,3 @@ def _find_frozen(label: str, name: str, digest: str, place: tuple[Path | str, st
         f"{label} acts with {name} of digest {digest[:_SHOWN]}, which is not here: {problems[0]}; "
         "name it with --primitives, or the registry that has it with --registry"
     )
-
-
-def parameters_digest(policy: NumpyPolicy | FrozenSkills) -> str:
-    """SHA-256 of every array that a policy or skills act by: the same before and after they were used.
-
-    Recorded results and saved orchestrators hold it.
-    """
-    digest = hashlib.sha256()
-    for name, array in sorted(_recorded(policy), key=operator.itemgetter(0)):
-        digest.update(f"{name} {array.dtype} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
-
-
-def _recorded(policy: NumpyPolicy | FrozenSkills) -> Iterator[tuple[str, Array]]:
-    """Arrays by the names that they had when the first digests were recorded."""
-    if not isinstance(policy, NumpyPolicy):
-        for owner, layers in (("._actor._layers", policy.actor.network["layers"]), ("._network", policy.network)):
-            for place, pair in enumerate(layers):
-                yield from ((f"{owner}._layers.{place}.{number}", array) for number, array in enumerate(pair))
-        return
-    for name, array in policy.network.items():
-        if not isinstance(array, list):  # of layers, which are there one by one, too
-            plain = name.replace("primitives.hidden", "primitives.head").replace("weight_floor", "floor")
-            parts = plain.replace("output_", "").split(".")
-            path = "".join(f"._layers.{part}" if part.isdigit() else f"._{part}" for part in parts)
-            yield path, array[:, None] if name == "primitives.output_bias" else array

@@ -18,7 +18,7 @@ from service.base.errors import CheckpointError, ConfigError, DivergedError, Tan
 from service.base.jsonl import plain
 from service.base.tensors import split_parts
 from service.base.types import Arrays, Metrics
-from service.base.user_code import CodeError, naming_unexpected, origin_of
+from service.base.user_code import CodeError, check_members, naming_unexpected, origin_of
 from service.config import Config
 from service.methods.method import Iteration, Method, State
 from service.policies.parameters import Parameters, PolicyError
@@ -92,6 +92,7 @@ class Run:
         with self.naming_errors():
             method = make()
         self._expect(isinstance(method, Method), "build", method, "a Method")
+        check_members(type(method), Method)
         self._expect(hasattr(method, "timing"), "build", method, "one whose __init__ calls super().__init__()")
         self.method = method
         method.on_wait = self._beat

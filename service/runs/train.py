@@ -262,7 +262,8 @@ def _run(
 
 
 def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, report: Report) -> Finished:
-    _logger.info("learning is over; now evaluating, publishing, drawing and recording a video")
+    publishing = "publishing, " * (publish and run.config.publishable)
+    _logger.info("learning is over; now evaluating, %sdrawing and recording a video", publishing)
     config, directory = run.config, run.directory
     with run.naming_errors():
         parameters, measured = run.parameters(), dict(run.numbers("measure", run.method.measure()))

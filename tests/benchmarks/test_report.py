@@ -17,7 +17,7 @@ from benchmarks.report.recipe import SHIPPED, check_words, differences, recipe_w
 from benchmarks.reproduce import RESULTS
 from service.base.errors import TandemError
 from service.config import load_config
-from service.registry.loading import parameters_digest
+from service.registry.digest import parameters_digest
 
 DOCS = Path(__file__).parents[2] / "docs"
 

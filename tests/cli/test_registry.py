@@ -12,7 +12,7 @@ import pytest
 import service
 from service.cli.registry import registry_app
 from service.registry.bundled import BUNDLED
-from service.registry.loading import parameters_digest
+from service.registry.digest import parameters_digest
 from service.registry.manifest import parse_manifest
 from service.registry.registry import Registry
 from tests.cli.typed import assert_refused, tandem

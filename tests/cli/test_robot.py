@@ -77,7 +77,7 @@ def test_two_cubes_have_a_goal_each_and_are_drawn_where_they_were(tmp_path):
     assert drawn.goal.shape == (1, 6)
     assert_refused(
         invoke("run", "--robot", "mujoco", goal.replace("0.025", "0.02"), *two),
-        "write one point, no lower than each object lies, 0.025 and 0.025 m",
+        "is inside the table: a goal is for the object's centre, which lies 0.025 and 0.025 m high there",
     )
 
 
@@ -120,7 +120,7 @@ def test_what_calibrate_writes_run_reads(tmp_path, monkeypatch):
         (["--robot", "gone.yaml"], "no file gone.yaml: name a YAML file of a robot, or one of mujoco"),
         (["--robot", "mujoco", "--goal", "1,2,3"], "--goal: 1.000, 2.000, 3.000 is outside of the workspace"),
         (["--robot", "mujoco", "--goal", "here"], "--goal 'here': write a point x,y,z in metres\n"),
-        (["--robot", "mujoco", "--goal", "0,0,0.02"], "--goal 0,0,0.02: write one point, no lower than"),
+        (["--robot", "mujoco", "--goal", "0,0,0.02"], "--goal: 0.000, 0.000, 0.020 is inside the table"),
         (["--robot", "mujoco", "--goal", "0,0,0.2;0,0,0.1"], "0,0,0.1: write one point"),
         (["--robot", "mujoco", "--policy", "nobody@1"], "nobody"),
         (["--robot", "mujoco", "--set", "safety.max_speed=1"], "--set: unknown key 'safety.max_speed'; known there: "),

@@ -149,7 +149,7 @@ def test_what_learns_nothing_is_measured_as_a_run_is(tmp_path, monkeypatch):
         ("--out is for a task", ("--out", "x.json")),
         ("--method ours learns: tandem train", ("--task", "push", "--method", "ours")),
         ("unknown method 'idel'", ("--task", "push", "--method", "idel")),
-        ("needs skills", ("--task", "push", "--method", "lsd-zero-shot")),
+        ("acts by skills", ("--task", "push", "--method", "lsd-zero-shot")),
     ):
         assert_refused(tandem("evaluate", *arguments), words)
 

@@ -75,7 +75,10 @@ def test_an_open_finger_fits_beside_every_start():
 @pytest.mark.parametrize(
     ("world", "said"),
     [
-        ({"fixtures": [{**POST, "position_m": (-0.05, 0.0)}]}, ["the gripper is inside fixture_0-0", "start_height_m"]),
+        (
+            {"fixtures": [{**POST, "position_m": (-0.05, 0.0)}]},
+            ["m deep inside world.fixtures[0]: raise world.start_height_m"],
+        ),
         ({"fixtures": [{**BLOCK, "size_m": (0.5, 0.5, 0.04), "position_m": (-0.05, 0.0)}]}, ["leave no room"]),
     ],
     ids=["in the gripper", "everywhere"],

@@ -103,6 +103,18 @@ def test_a_file_in_millimetres(tmp_path):
         world_with(file)
     assert_one_line(error.value, "60 x 40 x 30 m", "other units", "scale: 0.001")
     np.testing.assert_allclose(world_with(file, scale=0.001).world.shape.extent_m, (0.06, 0.04, 0.03), atol=1e-6)
+    with pytest.raises(ConfigError) as error:
+        world_with(write_box(tmp_path / "cm.obj", (6.0, 4.0, 3.0)))
+    assert_one_line(error.value, "6 x 4 x 3 m", "scale: 0.01 ")
+
+
+def test_a_size_that_is_not_that_of_its_files(tmp_path):
+    file = write_box(tmp_path / "box.obj", (0.06, 0.04, 0.03))
+    config = world_with(file, overrides=["world.object.size_m=[0.06, 0.04, 0.03]"])
+    np.testing.assert_allclose(config.world.shape.extent_m, (0.06, 0.04, 0.03), atol=1e-6)
+    with pytest.raises(ConfigError) as error:
+        world_with(file, overrides=["world.object.size_m=[0.05, 0.04, 0.03]"])
+    assert_one_line(error.value, "size_m = [0.05, 0.04, 0.03]", "have [0.06, 0.04, 0.03]: leave it out")
 
 
 def test_it_is_picked_up_carried_and_held(tmp_path):
@@ -141,10 +153,13 @@ def test_mistakes_are_one_line(tmp_path):
     (tmp_path / "text.stl").write_text("no mesh")
     with pytest.raises(ConfigError) as error:
         world_with(tmp_path / "text.stl")
-    assert_one_line(error.value, "text.stl", "MuJoCo cannot use it")
+    assert_one_line(error.value, "text.stl", "MuJoCo cannot use it", "give an STL or OBJ file")
     for described, said in (
-        ("{shape: mesh, size_m: [0.05, 0.05, 0.05]}", ["mesh, which names files as pieces"]),
-        ("{shape: box, size_m: [0.05, 0.05, 0.05], mesh: {pieces: [a.stl]}}", ["belongs to shape: mesh"]),
+        ("{shape: mesh, size_m: [0.05, 0.05, 0.05]}", ["shape: mesh needs its files, mesh: {pieces: [FILE]}"]),
+        (
+            "{shape: box, size_m: [0.05, 0.05, 0.05], mesh: {pieces: [a.stl]}}",
+            ["belongs to shape: mesh, and this is a box"],
+        ),
         ("{shape: mesh, size_m: [0.05, 0.05, 0.05], mesh: {pieces: []}}", ["world.object.mesh.pieces"]),
     ):
         with pytest.raises(ConfigError) as error:

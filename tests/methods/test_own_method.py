@@ -121,6 +121,11 @@ def test_a_key_of_one_method_is_unknown_to_another(file, method, key, said):
     ("old", "new", "said"),
     [
         ("def step", "def steps", "mine.py:37: TypeError: Can't instantiate abstract class Climb"),
+        (
+            "def measure",
+            "def measur",
+            "mine.py: Climb.measur is no member of Method; did you mean 'measure'? The name of",
+        ),
         ("self.rng.random()", "self.rng.radnom()", "mine.py:14: AttributeError: "),
         ("Iteration(self.count(10) | {", "dict(self.count(10) | {", "mine.py: step gave a dict; give an Iteration"),
         ("count(10)", "count(0)", "mine.py: 20 iterations made no env steps; say how many with self.count(NUMBER)"),

@@ -85,16 +85,17 @@ def test_it_goes_the_way_of_ours(file, tmp_path):
     ("old", "new", "said"),
     [
         ("dim=1).mean()", "dim=7).mean()", "upwards.py:10: IndexError: "),
-        ("pays_features = True", "pays_features = False", "Upwards.paid gave shape [8, 3]; give [8], or set pays"),
-        ("- self.network(before)", ".mean()", "Upwards.paid gave float32 of shape (); give float of shape (8, 3)"),
+        ("pays_features = True", "pays_features = False", "Upwards.paid gave shape [16, 3]; give [16], or set pays"),
+        ("- self.network(before)", ".mean()", "Upwards.paid gave float32 of shape (); give float of shape (16, 3)"),
         ("dim=1).mean() +", "dim=1) +", "Upwards.loss gave shape [8]; give one number, such as its mean()"),
         ("return -(self", "return 0.0; -(self", "Upwards.loss gave a float; give a torch.Tensor"),
         ("return -(self", "return after.mean(); -(self", "Upwards.loss does not depend on the network that it is to"),
         ("self.network(before)\n", "self.network(before).numpy()\n", "RuntimeError: Can't call numpy() on Tensor"),
-        ("- self.network(before)", "/ 0.0", "Upwards.paid gave nan at [0, 0] of shape (8, 3)"),
+        ("- self.network(before)", "/ 0.0", "Upwards.paid gave nan at [0, 0] of shape (16, 3)"),
         ("class Upwards(IntrinsicReward)", "class Upwards", "upwards.py:Upwards: no class that derives from Intrin"),
         ("IntrinsicReward\n\nclass", "Gone\n\nclass", "upwards.py:2: ImportError: "),
         ("    def loss", NESTED, "Upwards.make_network: only torch.nn.Linear with torch.nn.ReLU between them can be"),
+        ("    prior =", "    priors =", "Upwards.priors is no member of IntrinsicReward; did you mean 'prior'?"),
         ("    def loss", FORGETS, "Upwards: goes on otherwise after load_state(state()): tensors() has to have all"),
     ],
 )  # fmt: skip
@@ -108,7 +109,7 @@ def test_what_is_wrong_is_said_before_anything_is_learned(file, tmp_path, old, n
 
 def test_an_error_while_it_learns_names_its_line(file, tmp_path):
     old = "return self.network(after) - self.network(before)"
-    file.write_text(CODE.replace(old, f"{old} if len(skill) < 16 else 1 / 0"))
+    file.write_text(CODE.replace(old, f"{old} if before.abs().max() > 1.5 else 1 / 0"))
     with pytest.raises(ConfigError) as error:
         train(
             load_config(None, SMALL),
@@ -117,6 +118,19 @@ def test_an_error_while_it_learns_names_its_line(file, tmp_path):
             on_iteration=lambda metrics: None,
         )
     assert_one_line(error.value, "upwards.py:13: ZeroDivisionError")
+
+
+def test_a_class_that_teaches_nothing_of_its_own_is_refused(file, tmp_path):
+    file.write_text(CODE.replace("def loss", "def _loss").replace("def paid", "def _paid"))
+    with pytest.raises(TandemError, match="Upwards has neither loss nor paid nor make_network: give one of them"):
+        load_config(None, SMALL).begin(tmp_path, None)
+
+
+def test_a_reward_that_needs_a_whole_batch_gets_one(file, tmp_path):
+    """As of the nearest of all states in a batch."""
+    whole = "assert len(before) in (8, 16)\n        return self.network(after)"
+    file.write_text(CODE.replace("return self.network(after) -", f"{whole} -"))
+    load_config(None, SMALL).begin(tmp_path, None)
 
 
 def test_what_the_class_says_is_not_chosen(file):

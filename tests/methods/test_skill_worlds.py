@@ -110,11 +110,13 @@ class TestBadInput:
     def test_skills_and_primitives_where_the_other_is_expected(self, champion):
         with pytest.raises(TandemError, match=r"made@1 is a set of skills of lsd; the method ours needs primitives"):
             check_fits(TASK_METHODS["ours"], made())
-        with pytest.raises(TandemError, match=r"the method LSD skills needs skills, and panda-cube@.* has none"):
+        with pytest.raises(TandemError, match=r"this method acts by skills, and panda-cube@.* has none"):
             check_fits(TASK_METHODS["lsd"], champion)
 
     def test_skills_of_another_method(self):
-        with pytest.raises(TandemError, match=r"made@1 holds skills of dads, this method takes those of lsd"):
+        with pytest.raises(
+            TandemError, match=r"made@1 holds skills of dads, this method takes those of lsd; any-skills takes all"
+        ):
             check_fits(TASK_METHODS["lsd"], made("dads"))
 
     def test_skills_of_another_robot(self, registry):

@@ -345,7 +345,7 @@ def test_hindsight_fades_out_with_the_run(champion):
         ),
         ({"world": {"friction": 0.5}}, "a task is learned in the world of its primitives; leave out world"),
         ({"primitives": "nothing@1"}, "nothing"),
-        ({"method": "lsd"}, r"the method LSD skills needs skills, and panda-cube@.* has none: name some"),
+        ({"method": "lsd"}, r"this method acts by skills, and panda-cube@.* has none: name some"),
         ({"reward_margin_m": 0.05}, "reward_margin_m = 0.05"),
     ],
 )

@@ -16,8 +16,8 @@ TABLETOP_ID = "tandem/Tabletop-v1"
 for _task in [Task("Tabletop"), *map(find_task, TASKS)]:
     gymnasium.register(
         id=_task.id,
-        entry_point=f"service.envs.gym.tabletop:{'TimeLimitedEnv' if _task.name else 'TabletopEnv'}",
+        entry_point="service.envs.gym.tabletop:TabletopEnv",
         vector_entry_point="service.envs.gym.vector:TabletopVectorEnv",
         max_episode_steps=_task.episode_steps if _task.name else None,  # one of a user's may be longer
-        kwargs={"task": _task.name} if _task.name else {},
+        kwargs={"registered": _task.name} if _task.name else {},
     )

@@ -53,7 +53,8 @@ class GoalWorlds:
     Args: those of ``TabletopEnv`` and of ``WorldBatch``.
 
     Raises:
-        TandemError: unknown task, goals that the world cannot have, a distance that is not positive.
+        TandemError: unknown task, goals that the world cannot have, a distance that is not positive, or a task
+            beside that of a Gymnasium name.
     """
 
     def __init__(
@@ -63,7 +64,14 @@ class GoalWorlds:
         config: WorldConfig | None,
         task: Path | str | Task | None,
         success_distance_m: float,
+        registered: str | None,
     ) -> None:
+        if registered is not None and task is not None:
+            raise TandemError(
+                f"{find_task(registered).id} has a task, and another one would leave out its world: take "
+                "tandem/Tabletop-v1, and give your task the world that it needs, such as {'fixture': 'wall'}"
+            )
+        task = task if registered is None else registered
         self.config = config or WorldConfig()
         if not isinstance(self.config, WorldConfig):
             raise TandemError(
@@ -174,6 +182,8 @@ class GoalWorlds:
                 f"reset: options['goal'] has shape {goal.shape}, not {(size,)} or {(num, size)}: give metres"
             )
         goal = goal.reshape(-1, size)
+        if not np.isfinite(goal).all():
+            raise TandemError(f"reset: options['goal'] = {options['goal']!r}: give finite numbers, metres")
         for bad in goal[self.rules.out_of_reach(goal)]:
             near = in_metres(self.rules.nearest(bad[None])[0])
             raise TandemError(
@@ -241,6 +251,7 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
         task: a downstream task, by name or file as commands take it, or as an object. It replaces part of ``config``,
             and has its goals, success and reward.
         success_distance_m: greatest distance that counts as reached, metres.
+        registered: the task of its Gymnasium name, whose episodes ``gymnasium.make`` ends; it gives this itself.
         render_mode: ``rgb_array`` or None.
         width: of rendered images, pixels.
         height: of rendered images, pixels.
@@ -251,8 +262,6 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012 - as the base class has it
-    _has_time_limit = False
-    """Whether something around it ends the episodes of a task that is given by name."""
 
     def __init__(
         self,
@@ -260,15 +269,16 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
         *,
         task: Path | str | Task | None = None,
         success_distance_m: float = 0.05,
+        registered: str | None = None,
         render_mode: str | None = None,
         width: int = 640,
         height: int = 480,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise TandemError(f"TabletopEnv: render_mode = {render_mode!r}; choose rgb_array or None")
-        super().__init__(1, 1, config, task, success_distance_m)
+        super().__init__(1, 1, config, task, success_distance_m, registered)
         self.np_random, self.render_mode = self._random[0], render_mode
-        self._counts_steps = not (self._has_time_limit and isinstance(task, str))
+        self._counts_steps = registered is None
         step_s = self.config.physics_step_s * self.config.num_substeps
         self.metadata = {**self.metadata, "render_fps": round(1.0 / step_s)}
         self.observation_space = goal_space(self.config)
@@ -335,12 +345,6 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
             self._renderer.close()
             self._renderer = None
         self._worlds.close()
-
-
-class TimeLimitedEnv(TabletopEnv):
-    """A ``TabletopEnv`` whose episodes ``gymnasium.wrappers.TimeLimit`` ends, as ``gymnasium.make`` puts around it."""
-
-    _has_time_limit = True
 
 
 def _first(observation: Observation) -> Observation:

@@ -37,6 +37,7 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         config: the world; the paper's by default.
         task: see ``TabletopEnv``.
         success_distance_m: greatest distance that counts as reached, metres.
+        registered: the task of its Gymnasium name; ``gymnasium.make_vec`` gives this itself.
         max_episode_steps: where episodes are truncated; None: where the task says; -1: nowhere.
         num_threads: native threads; 0 for one per core.
         render_mode: None, as there are no pictures of many worlds.
@@ -56,6 +57,7 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
         *,
         task: Path | str | Task | None = None,
         success_distance_m: float = 0.05,
+        registered: str | None = None,
         max_episode_steps: int | None = None,
         num_threads: int = 0,
         render_mode: None = None,
@@ -69,7 +71,7 @@ class TabletopVectorEnv(GoalWorlds, gymnasium.vector.VectorEnv[Any, FloatArray, 
                 f"TabletopVectorEnv: render_mode = {render_mode!r}; for pictures give gymnasium.make_vec "
                 'vectorization_mode="sync"'
             )
-        super().__init__(num_envs, num_threads, config, task, success_distance_m)
+        super().__init__(num_envs, num_threads, config, task, success_distance_m, registered)
         self.num_envs = num_envs
         self.max_episode_steps = self.rules.task.episode_steps if max_episode_steps is None else max_episode_steps
         self.single_observation_space, self.single_action_space = goal_space(self.config), action_space()

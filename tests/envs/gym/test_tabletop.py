@@ -85,6 +85,12 @@ def test_make_says_where_episodes_of_a_named_task_end(options, expected):
     many.close()
 
 
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_a_name_with_a_task_takes_no_other_task(make):
+    with pytest.raises(TandemError, match="tandem/Wall-v1 has a task, and another one would leave out its world: take"):
+        make("tandem/Wall-v1", task=Task("Mine"))
+
+
 def test_nothing_is_stepped_before_an_episode_begins(env):
     envs = TabletopVectorEnv(2, CONFIG, num_threads=1)
     for each, still in ((env, np.zeros(4)), (envs, np.zeros((2, 4)))):
