@@ -377,12 +377,12 @@ def test_render_films_rounds_of_a_run_and_episodes_of_published_primitives(train
 def test_render_films_goals_that_are_typed(trained, monkeypatch, tmp_path):
     shown = []
     monkeypatch.setattr("service.media.video.write_episode_video", lambda *arguments: shown.append(arguments))
-    goals = ("--goals", "0.02,0,0.2; 0,-0.05,0.025")
+    goals = ("--goals", "0.02,0,0.2; 0,-0.05,0.035")
     look = ("--size", "640x360", "--camera", "side,distance=2", "--speed", 0.5)
     result = tandem("render", trained.run, *goals, *look, "--out", tmp_path / "a.gif")
     assert result.exit_code == 0, result.output
     ((episodes, _, path, options),) = shown
-    assert episodes.goal.tolist() == [[0.02, 0.0, 0.2], [0.0, -0.05, 0.025]]
+    assert episodes.goal.tolist() == [[0.02, 0.0, 0.2], [0.0, -0.05, 0.035]]
     assert (path, options.width, options.height, options.speed) == (tmp_path / "a.gif", 640, 360, 0.5)
     assert (options.view.azimuth_deg, options.view.distance_m) == (90.0, 2.0)
 
