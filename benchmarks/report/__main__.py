@@ -40,7 +40,7 @@ PAGES = {
     ),
     "results/pretraining-v1.md": ("tasks", "curves", "curriculum", "coverage", "throughput"),
     "results/deployed.md": ("checks",),
-    "results/skills.md": ("coverage", "curves"),
+    "results/skills.md": ("today", "coverage", "curves"),
     "results/comparison.md": ("rows", "longer", "below", "harder", "missing"),
     "downstream.md": ("headline",),
     "robots.md": ("robots",),
@@ -108,8 +108,9 @@ class Report:
         on_two_cubes = list(read_all(todays / "two_cubes").values())
         check_versions(on_two_cubes)
         two_cubes = by_method_and_task(on_two_cubes)
-        # of version 1 until those of today's are whole
-        recorded_skills = list(read_all(self._results / "skills").values())
+        earlier_skills, skills_today = (
+            list(read_all(where / "skills").values()) for where in (self._results, todays)
+        )
         for page, names in PAGES.items():  # what is wrong with a page is found before anything is drawn
             words = replace_blocks(self._docs / page, dict.fromkeys(names, ""))
             if page in ABOUT_THE_RECIPE:
@@ -125,7 +126,7 @@ class Report:
         made = measured_blocks(found) | {
             "results/pretraining.md": pretraining_blocks(found, seeds, why),
             "results/pretraining-v1.md": self.earlier_blocks(runs, found),
-            "results/skills.md": self.skills_blocks(recorded_skills),
+            "results/skills.md": self.skills_blocks(earlier_skills, skills_today),
             "results/comparison.md": self.comparison_blocks(trials),
             "downstream.md": {"headline": [headline]},
             "../README.md": {
@@ -195,12 +196,14 @@ class Report:
         """Recorded trials beside the table's, such as ``longer`` ones."""
         return list(read_all(self._results / RESULTS.name / f"downstream_{name}").values())
 
-    def skills_blocks(self, runs: Sequence[Run]) -> Blocks:
-        """Parts of the blocks about skills."""
+    def skills_blocks(self, runs: Sequence[Run], todays: Sequence[Run]) -> Blocks:
+        """Parts of the blocks about skills: those of version 1 of what learns, and today's, which are not whole."""
         stages = self.show("Random skills at three stages of training", "skills", figures.draw_skills, runs)
         learned = [run for run in runs if run["method"] != "ours"]
         curves = self.show("Skill discovery over env steps", "skills-curves", figures.draw_skill_curves, learned)
+        again = self.show("The same, made anew", "skills-curves-today", figures.draw_skill_curves, todays)
         return {
+            "today": [skills.coverage_table(todays), again],
             "coverage": [skills.coverage_table(runs), stages],
             "curves": [curves],
         }
