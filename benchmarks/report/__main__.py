@@ -108,9 +108,7 @@ class Report:
         on_two_cubes = list(read_all(todays / "two_cubes").values())
         check_versions(on_two_cubes)
         two_cubes = by_method_and_task(on_two_cubes)
-        earlier_skills, skills_today = (
-            list(read_all(where / "skills").values()) for where in (self._results, todays)
-        )
+        earlier_skills, skills_today = (list(read_all(where / "skills").values()) for where in (self._results, todays))
         for page, names in PAGES.items():  # what is wrong with a page is found before anything is drawn
             words = replace_blocks(self._docs / page, dict.fromkeys(names, ""))
             if page in ABOUT_THE_RECIPE:

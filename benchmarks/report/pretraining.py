@@ -11,7 +11,7 @@ from benchmarks.record_run import ASKED, ASKED_RATES, ASKED_STEPS, TASKS
 from benchmarks.report.markdown import Row, commit, duration, millions, percent
 from benchmarks.run_files import RANDOM, STAGES, Records, Run, binned, mean_share, steps_until, unthin
 from benchmarks.seeds import KINDS, NUM_EPISODES
-from benchmarks.why_alice import ARMS, ENV_STEPS
+from benchmarks.why_alice import ARMS
 from service.base.markdown import table
 from service.config.self_play import SelfPlayConfig
 from service.methods.task_evaluation import rate_of
@@ -193,7 +193,7 @@ def why_alice_words(studies: Mapping[str, Mapping[str, Any]]) -> str:
         f"{mean['no-difficulty']} if his failures do not pay her."
         f"\nWith goals of the whole workspace added: {mean['uniform']} with Alice, {mean['uniform-new-alice']} "
         f"({min(random):.0f} to {max(random):.0f} by seed) beside an Alice who does not learn, "
-        f"{mean['uniform-alone']} without her ({num_seeds} seeds, {millions(ENV_STEPS)} env steps)."
+        f"{mean['uniform-alone']} without her (means of {num_seeds} seeds)."
     )
 
 

@@ -21,7 +21,7 @@ LEVEL = 0.05
 
 
 def ahead_words(results: Sequence[Result], composing: str, task: str) -> str:
-    """Until when composing is ahead of the best that learns from nothing, and what is between them at the end."""
+    """When composing is last ahead of the best that learns from nothing, and what is between them at the end."""
     of = by_method_and_task(results)
     rivals = [of[name, task] for name in learning(None) if (name, task) in of]
     if not rivals or (composing, task) not in of:
@@ -29,13 +29,13 @@ def ahead_words(results: Sequence[Result], composing: str, task: str) -> str:
     steps = [point["env_steps"] for point in of[composing, task][0]["curve"]]
     own, best = _means(of[composing, task], steps), np.max([_means(seeds, steps) for seeds in rivals], axis=0)
     ahead = np.flatnonzero(own - best >= LEVEL)
-    until = f"until {round(steps[ahead[-1]], -3):,} env steps" if len(ahead) else "nowhere"
+    when = f"last after {round(steps[ahead[-1]], -3):,} env steps" if len(ahead) else "never"
     last = round(100 * (rate_of(of[composing, task]).mean - max(rate_of(seeds).mean for seeds in rivals)))
     points = f"{abs(last)} point{'s' * (abs(last) > 1)}"
     end = f"it is {points} {'ahead' if last > 0 else 'behind'}" if last else "they are level"
     return (
-        f"On *{find_task(task).title}* composing is ahead of learning from nothing by {100 * LEVEL:.0f} points or more "
-        f"{until}; at the end {end}."
+        f"On *{find_task(task).title}* composing is {100 * LEVEL:.0f} points or more ahead of learning from nothing "
+        f"{when}; at the end {end}."
     )
 
 
@@ -67,15 +67,18 @@ def without_hindsight_words(results: Sequence[Result]) -> str:
 
 
 def _good_places(trials: Sequence[Result]) -> str:
-    """Such as ``on *InAir* after 0.5 M env steps (1 seed)``: of the first method that gets there."""
+    """Such as ``with MCP on *InAir* after 0.5 M env steps (1 seed)``: of the first method that gets there."""
     of = by_method_and_task(trials)
-    places = []
+    places = {"with MCP": list[str](), "without MCP": list[str]()}
     for task in PAPERS:
         found = {name: mean_until(of[name, task], GOOD) for name in learning(None) if (name, task) in of}
-        soon = [each for each in found.values() if each is not None]
+        soon = {name: steps for name, steps in found.items() if steps is not None}
         if soon:
-            places.append(f"on *{find_task(task).title}* after {millions(min(soon))}")
-    return f"{', '.join(places)} env steps {_seeds_words(list(of.values()))}" if places else ""
+            first = min(soon, key=lambda name: soon[name])
+            network = "with MCP" if TASK_METHODS[first].mcp_actor else "without MCP"
+            places[network].append(f"on *{find_task(task).title}* after {millions(soon[first])}")
+    words = ", ".join(f"{network} {', '.join(each)}" for network, each in places.items() if each)
+    return f"{words} env steps {_seeds_words(list(of.values()))}" if words else ""
 
 
 def _means(seeds: Seeds, steps: Sequence[int]) -> FloatArray:

@@ -11,7 +11,7 @@ import importlib.util
 import linecache
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from hashlib import sha256
 from pathlib import Path
@@ -228,17 +228,22 @@ def find_class(named: str, texts: Texts, base: type) -> Any:
     return find(reference, texts, is_own, f"class that derives from {base.__name__}")
 
 
-def check_members(kind: type, base: type) -> None:
+def check_members(kind: type, base: type, replaceable: Sequence[str]) -> None:
     """Refuse a class of a user's that misspells a member of its base: the base's own would be used in its place.
 
+    Args:
+        kind: the class.
+        base: its base.
+        replaceable: members of the base that a class may have of its own.
+
     Raises:
-        CodeError: it has a public member that is spelt almost like one of the base.
+        CodeError: it has a public member that is spelt almost like one of these, which it has not.
     """
     from difflib import get_close_matches
 
-    known = [name for name in dir(base) if not name.startswith("_")]
     own = {name for each in kind.__mro__ if origin_of(each) is not None for name in vars(each)}
-    for name in sorted(own - {*known}):
+    known = [name for name in replaceable if name not in own]
+    for name in sorted(own - {*dir(base)}):
         if not name.startswith("_") and (like := get_close_matches(name, known, n=1, cutoff=ALIKE)):
             raise CodeError(
                 f"{origin_of(kind)}: {kind.__name__}.{name} is no member of {base.__name__}; did you mean "

@@ -314,7 +314,7 @@ def parse_points(option: str, text: str, world: WorldConfig, expected: str) -> S
         TandemError: no points; or one outside of the workspace, inside the table or a fixture, or of objects inside
             each other.
     """
-    from service.envs.sampling import inside_each_other, inside_fixtures
+    from service.envs.sampling import inside_each_other, inside_fixtures, inside_table
 
     try:
         points = np.array([[float(part) for part in point.split(",")] for point in text.strip("; ").split(";")])
@@ -328,7 +328,7 @@ def parse_points(option: str, text: str, world: WorldConfig, expected: str) -> S
         raise TandemError(
             f"{option}: {in_metres(point)} is outside of the workspace, ({in_metres(low)}) to ({in_metres(high)}) m"
         )
-    for point in points[(each_object(points)[:, :, 2] < np.round(world.rest_heights_m, 6)).any(axis=1)]:
+    for point in points[inside_table(points, world)]:
         lowest = " and ".join(f"{height_m:g}" for height_m in world.rest_heights_m)
         raise TandemError(
             f"{option}: {in_metres(point)} is inside the table: a goal is for the object's centre, which lies {lowest} "

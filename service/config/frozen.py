@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
@@ -25,8 +26,9 @@ class FrozenModel(BaseModel):
         return value
 
 
-_UNITS = {"_m": "metres", "_kg": "kg", "_s": "seconds", "_rad": "radians"}
-"""By the ends of keys."""
+_UNIT = re.compile(r"(?<!_m)(?<!_n)(?<!_rad)_(m|kg|s|rad)$")
+"""The end of a key that has a unit alone, and no quotient or product of some."""
+_WORDS = {"m": "metres", "kg": "kg", "s": "seconds", "rad": "radians"}
 _BOUNDS = ("less_than", "greater_than")
 """Begin the types of errors about a number that is out of range."""
 _WANTED = {
@@ -55,8 +57,8 @@ def first_error(error: ValidationError) -> str:
     words = _WANTED.get(first["type"], first["msg"].removeprefix("Value error, "))  # which our own checks have
     if first["type"] == "literal_error" and {BUILT_IN, NAMED} & {*first["loc"]}:
         words += ", or describe one: {KEY: VALUE}"
-    if first["type"].startswith(_BOUNDS):
-        words += next((f" ({unit})" for end, unit in _UNITS.items() if key.rstrip(".0123456789").endswith(end)), "")
+    if first["type"].startswith(_BOUNDS) and (unit := _UNIT.search(key.rstrip(".0123456789"))) is not None:
+        words += f" ({_WORDS[unit[1]]})"
     if not key and first["type"] == "value_error":  # our own checks of what belongs together name the keys
         return str(words)
     return f"{key or 'the top level'}{found}: {words}"

@@ -21,6 +21,8 @@ PACKAGE = "package:"
 """Begins the name of a file in a Python package."""
 LEAST_M, MOST_M = 0.005, 0.5
 """Extents that an object may have."""
+_USUAL_M = 0.05
+"""Extent of an object that is neither large nor small."""
 LEAST_CONVEX = 0.95
 """Share that a piece must have of the volume of its convex hull, which is what touches."""
 Vector = tuple[float, float, float]
@@ -98,8 +100,9 @@ class MeshConfig(FrozenModel):
         extent = upper - lower
         if not _fits(extent):
             sizes = " x ".join(f"{each:.3g}" for each in extent)
-            fitting = [self.scale * each for each in (1e-3, 1e-2, 1e3) if _fits(extent * each)]
-            hint = f"; with scale: {fitting[0]:g} it would fit" if fitting else ""
+            fitting = [each for each in (1e-3, 1e-2, 1e3) if _fits(extent * each)]
+            likely = min(fitting, key=lambda each: abs(np.log(each * extent.max() / _USUAL_M)), default=None)
+            hint = f"; with scale: {self.scale * likely:g} it would fit" if likely is not None else ""
             raise ConfigError(
                 f"mesh {pieces[0]} is {sizes} m large, and objects have {LEAST_M:g} to {MOST_M:g} m: is its file in "
                 f"other units?{hint}"

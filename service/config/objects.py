@@ -127,12 +127,14 @@ def _read_mesh(value: Any) -> Any:
     if mesh.sha256:
         return value
     read, extent_m = mesh.measured()
-    if (given := value.get("size_m")) is not None and not np.allclose(given, extent_m, rtol=1e-3):
+    given = extent_m if value.get("size_m") is None else value["size_m"]
+    numbers = isinstance(given, list | tuple) and all(isinstance(each, int | float) for each in given)
+    if numbers and len(given) == len(extent_m) and not np.allclose(given, extent_m, rtol=1e-3):
         raise ValueError(
-            f"size_m = {given} of a mesh is read from its files, which have {[round(each, 4) for each in extent_m]}: "
-            "leave it out; mesh.scale makes it larger or smaller"
+            f"size_m = {[*given]} of a mesh is read from its files, which have "
+            f"{[round(each, 4) for each in extent_m]}: leave it out, or give null; mesh.scale changes it"
         )
-    return {**value, "mesh": read, "size_m": extent_m}
+    return {**value, "mesh": read, "size_m": given}
 
 
 Object = Annotated[

@@ -221,8 +221,7 @@ class WorldConfig(FrozenModel):
             )
         if self.observed.obstacles and not self.obstacles:
             raise ValueError("observed.obstacles, and no obstacles: describe some, or leave it out")
-        ranges = self.randomisation.model_ranges
-        lowest_m, smallest = (ranges.get(name, (usual,))[0] for name, usual in _LOWEST.items())
+        lowest_m, smallest = self._lowest
         if lowest_m + (rest_m := smallest * min(self.rest_heights_m)) < 0.0:
             raise ValueError(
                 f"randomisation.table_height_m begins at {lowest_m:g}: the centre of the smallest object would lie "
@@ -295,6 +294,19 @@ class WorldConfig(FrozenModel):
     def rest_heights_m(self) -> tuple[float, ...]:
         """(K,) height of each object's centre as it lies on the table."""
         return tuple(body.extent_m[2] / 2 for body in self.bodies)
+
+    @property
+    def lowest_heights_m(self) -> tuple[float, ...]:
+        """(K,) least height of each object's centre: the smallest one, on its flattest side, on the lowest table."""
+        lowest_m, smallest = self._lowest
+        return tuple(lowest_m + smallest * min(body.extent_m) / 2 for body in self.bodies)
+
+    @property
+    def _lowest(self) -> tuple[float, float]:
+        """Height of the lowest table, metres, and size of the smallest object, as a share of what is described."""
+        ranges = self.randomisation.model_ranges
+        lowest_m, smallest = (ranges.get(name, (usual,))[0] for name, usual in _LOWEST.items())
+        return lowest_m, smallest
 
     @property
     def rest_height_m(self) -> float:

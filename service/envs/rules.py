@@ -14,7 +14,6 @@ from service.config.run import SUCCESS_DISTANCE_M
 from service.envs.batch import WorldBatch
 from service.envs.observations import distances, each_object
 from service.envs.sampling import (
-    TOUCHES_M,
     GoalKind,
     check_goals,
     draw_goals,
@@ -23,6 +22,7 @@ from service.envs.sampling import (
     inside_fixtures,
     inside_gripper_or_table,
     inside_obstacles,
+    inside_table,
 )
 from service.envs.task import Bodies, Task, View
 
@@ -59,9 +59,6 @@ class Rules:
                 "others: leave that out"
             )
         self._worlds, self._near_m = worlds, success_distance_m
-        flatter_m = [(body.extent_m[2] - min(body.extent_m)) / 2 for body in worlds.config.bodies]
-        self._lowest_m = worlds.bank.rest_heights_m.min(axis=0) - flatter_m
-        """(K,) heights of the objects' centres as they lie on their lowest side on the lowest table."""
         self.elapsed: NDArray[np.int64] = np.zeros(worlds.num_worlds, dtype=np.int64)
         """(N,) steps of the episode so far."""
         self.memory: StateArray = np.zeros((worlds.num_worlds, self.task.memory_size))
@@ -189,10 +186,8 @@ class Rules:
 
         So it is inside of the table, too: the place of an object is its centre.
         """
-        near = np.all(distances(self.nearest(goal), goal) <= self._near_m, axis=1)
-        above = np.all(each_object(goal)[:, :, 2] >= self._lowest_m - TOUCHES_M, axis=1)
-        out: BoolArray = ~(near & above)  # what is no number is out of reach, too
-        return out
+        near: BoolArray = np.all(distances(self.nearest(goal), goal) <= self._near_m, axis=1)
+        return ~near | inside_table(goal, self._worlds.config)  # what is no number is out of reach, too
 
     def _asked(self, name: str, shape: tuple[int, ...], *given: Any, truth: bool = False) -> Array:
         function = getattr(self.task, name)

@@ -30,7 +30,7 @@ _NUM_DRAWS = 20
 """Of the place of one obstacle, or of the object beside a box, before all in a world are drawn anew."""
 _NUM_ARRANGEMENTS = 60
 _MAX_DRAWS = 1000
-TOUCHES_M = 0.001
+_TOUCHES_M = 0.001
 """An object that stands on a fixture is not inside it, however its place was rounded."""
 _BESIDE_OBJECT_M = np.array([scene.GAP_M, scene.FINGER_GAP_M, scene.GAP_M])
 
@@ -427,19 +427,26 @@ def inside_each_other(position: StateArray, config: WorldConfig) -> BoolArray:
     return inside
 
 
+def inside_table(position: StateArray, config: WorldConfig) -> BoolArray:
+    """(N,) whether an object at its place of (N, 3 K) would be inside the table, however it lies there."""
+    low: BoolArray = each_object(position)[:, :, 2] < np.subtract(config.lowest_heights_m, _TOUCHES_M)
+    inside: BoolArray = np.any(low, axis=1)
+    return inside
+
+
 def inside_gripper_or_table(position: StateArray, config: WorldConfig, gripper: Boxes, rest_m: StateArray) -> BoolArray:
     """(N,) whether an object at its place of (N, 3 K) would be more than a millimetre inside of these.
 
     On the table, objects rest at heights of (K,) or (N, K) ``rest_m``.
     """
-    low = (each_object(position)[:, :, 2] < rest_m - TOUCHES_M).any(axis=1)
+    low = (each_object(position)[:, :, 2] < rest_m - _TOUCHES_M).any(axis=1)
     inside: BoolArray = low | _some_object(position, config, lambda around: _overlap(_smaller(around), gripper))
     return inside
 
 
 def _smaller(around: Boxes) -> Boxes:
     """Boxes that do not reach into what they only touch, however places were rounded."""
-    return Boxes(around.lower + TOUCHES_M, around.upper - TOUCHES_M)
+    return Boxes(around.lower + _TOUCHES_M, around.upper - _TOUCHES_M)
 
 
 def _some_object(position: StateArray, config: WorldConfig, test: Callable[[Boxes], BoolArray]) -> BoolArray:

@@ -74,7 +74,6 @@ class CheckedSource:
         self, config: SelfPlayConfig, coverage: float, success_rate: float, near: Callable[[StateArray], BoolArray]
     ) -> None:
         kind: type[GoalSource] = find_class(config.generator.goal_source, config.code, GoalSource)
-        check_members(kind, GoalSource)
         self._origin, self._name, self._near = getfile(kind), kind.__name__, near
         self._known = Known(config.world, config.success_distance_m, coverage, success_rate, self._asked_near)
         with naming_errors_of(self._origin):
@@ -89,19 +88,20 @@ class CheckedSource:
             goal = goal.reshape(-1, num, 3)
         shape = len(np.atleast_1d(goal)), num, 3
         goal = checked(f"{self._origin}: {self._name}.goals", goal, shape)
-        self._first = goal[:1].reshape(-1, 3)
-        kept: StateArray = goal[in_workspace(goal, self._known.world.workspace).all(axis=1)].reshape(-1, shape[1] * 3)
+        inside = in_workspace(goal, self._known.world.workspace).all(axis=1)
+        self._outside = goal[~inside][:1].reshape(-1, 3)
+        kept: StateArray = goal[inside].reshape(-1, shape[1] * 3)
         world = self._known.world
         return kept[~(inside_each_other(kept, world) | inside_fixtures(kept, world))]
 
     @property
     def left_out(self) -> str:
-        """Words for the first goal that it gave last and the workspace; empty where it gave none."""
-        if not len(self._first):
+        """Words for a goal that it gave last and that is outside the workspace; empty where there was none."""
+        if not len(self._outside):
             return ""
         workspace = self._known.world.workspace
         low, high = in_metres(workspace.lower_m), in_metres(workspace.upper_m)
-        return f"; its first is ({in_metres(self._first[0])}) m, and the workspace ({low}) to ({high}) m"
+        return f", as ({in_metres(self._outside[0])}) m is outside: that is ({low}) to ({high}) m"
 
     def _asked_near(self, goal: StateArray) -> BoolArray:
         """``Known.near``, of (M, 3 K) or (M, K, 3) goals."""
@@ -135,18 +135,20 @@ def check_source(config: SelfPlayConfig) -> None:
     Raises:
         ConfigError: it does not run, gives something else, or no goal in the workspace.
     """
-    rng = np.random.default_rng(0)
-    found = list[int]()
+    check_members(find_class(config.generator.goal_source, config.code, GoalSource), GoalSource, ("goals", "weights"))
+    rng, tried = np.random.default_rng(0), list[tuple[int, str]]()
     for near in (False, True):
         source = CheckedSource(config, 0.0, 0.0, partial(_all, near))
         goal = source.goals(rng)
         source.weights(goal, np.zeros_like(goal), np.full(len(goal), 0.25))
-        found.append(len(goal))
+        tried.append((len(goal), source.left_out))
     # Alice brings the object to some cells first; without her nothing is ever near.
-    if not (any(found) if config.game.alice_plays else found[0]):
+    counted = tried if config.game.alice_plays else tried[:1]
+    if not any(num for num, _ in counted):
+        left_out = next(filter(None, (words for _, words in counted)), "")
         raise ConfigError(
-            f"generator.goal_source = {config.generator.goal_source!r}: it gives no goal in the workspace "
-            f"while nothing is known{source.left_out}: let it give some without known.near, such as known.random(rng)"
+            f"generator.goal_source = {config.generator.goal_source!r}: it gives no goal in the workspace while "
+            f"nothing is known{left_out}: let it give some without known.near, such as known.random(rng)"
         )
 
 

@@ -16,7 +16,7 @@ from service.actors.evaluation import EVALUATION_SEED
 from service.base.errors import ConfigError
 from service.base.tensors import join_parts, split_parts
 from service.base.types import Metrics
-from service.base.user_code import CodeError, checked, naming_errors_of, recorded
+from service.base.user_code import CodeError, check_members, checked, naming_errors_of, recorded
 from service.config import parse_config
 from service.config.skills import SKILLS_OF, SkillDiscoveryConfig, SkillsConfig
 from service.generator.bins import GoalCells, in_air
@@ -31,6 +31,11 @@ from service.policies.parameters import Parameters
 from service.registry.loading import Trained
 from service.registry.publishing import measure_skills
 from service.store.models import GoalGrid
+
+_REPLACEABLE = (
+    "prior", "zero_shot", "pays_jumps", "pays_features", "make_network", "loss", "paid", "learned", "tensors",
+)  # fmt: skip
+"""What a reward of a user's may have of its own."""
 
 
 class SkillDiscovery(Method):
@@ -154,6 +159,9 @@ def check_reward(config: SkillsConfig, code: Mapping[str, str]) -> IntrinsicRewa
     """
     kind = find_reward(config.method, code)
     origin = getfile(kind)
+    check_members(kind, IntrinsicReward, _REPLACEABLE)
+    if all(getattr(kind, name) is getattr(IntrinsicReward, name) for name in ("loss", "paid", "make_network")):
+        raise CodeError(f"{origin}: {kind.__name__} has neither loss nor paid nor make_network: give one of them")
     random = torch.Generator().manual_seed(0)
 
     def drawn(num: int) -> list[torch.Tensor]:

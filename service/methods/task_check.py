@@ -41,9 +41,8 @@ def check_fits(method: TaskMethod, trained: Trained) -> None:
     if method.composes:
         check_primitives(trained)
     if method.skills is not None and (found := trained.skills.method) != method.skills:
-        raise TandemError(
-            f"{trained.label} holds skills of {found}, this method takes those of {method.skills}; any-skills takes all"
-        )
+        hint = "; any-skills takes all" * method.learns
+        raise TandemError(f"{trained.label} holds skills of {found}, this method takes those of {method.skills}{hint}")
 
 
 def check_task(task: Task, world: WorldConfig, *, relabels: bool = False) -> None:

@@ -207,13 +207,19 @@ class Trained:
     def act_deterministic(self, observation: FloatArray | Mapping[str, FloatArray]) -> FloatArray:
         """Compute (N, 4) actions in [-1, 1] from (N, O) positions and goal, such as (N, 14), metres.
 
-        Or from the observation of a Gymnasium environment of Tandem, which has both. Bob takes (O,), too.
+        Or (4,) from (O,); or from what a Gymnasium environment of Tandem shows, which has both.
 
         Raises:
             PolicyError: another shape; of a policy of a task another N than in the step before, without ``begin``.
         """
         if isinstance(observation, Mapping):
+            if missing := {"observation", "desired_goal"} - observation.keys():
+                raise PolicyError(
+                    f"observation: no {' and no '.join(sorted(missing))}; give positions and goal, (N, O)"
+                )
             observation = np.concatenate([observation["observation"], observation["desired_goal"]], axis=-1)
+        if observation.ndim == 1:
+            return np.squeeze(self.act_deterministic(observation[None]), axis=0)
         return np.clip(self.policy.act_deterministic(observation), -1.0, 1.0)
 
     def player(self) -> DeterministicPolicy:

@@ -135,7 +135,7 @@ def test_what_alice_is_for_by_hand():
         "solves 96 % of random goals; 50 % if he clones none of her turns, 15 % if his failures do not pay her" in words
     )
     assert "15 % with Alice, 15 % (10 to 20 by seed) beside an Alice who does not learn, 15 % without her" in words
-    assert words.endswith(" (3 seeds, 4 M env steps).")
+    assert words.endswith(" (means of 3 seeds).")
 
 
 @pytest.mark.parametrize("name", ARMS)

@@ -42,6 +42,7 @@ def learned(tmp_path_factory):
         done = tandem("train", "wall", "--primitives", "panda-cube@champion", "--set", "seed=3", *SETS)
     assert done.exit_code == 0, done.output
     assert "evaluation/mean_distance_m" in done.stdout
+    assert done.stdout.endswith("\ntry it:      tandem play runs/wall-ours-3\n")
     return home
 
 
@@ -63,6 +64,9 @@ def test_resume_auto_begins_a_run_and_goes_on_with_it(tmp_path, monkeypatch):
     assert (config.primitives, config.task_version, result["env_steps"]) == (CHAMPION, 1, 600)
     more = tandem("train", "--resume", "--run-dir", path, "--set", "run.total_env_steps=800")
     assert "finished after 800 env steps" in more.stdout
+    assert "nothing was left" not in more.stdout
+    again = tandem("train", "--resume", "--run-dir", path)
+    assert "nothing was left to learn: run.total_env_steps is 800; raise it by --set to go on" in again.stdout
     assert_refused(tandem(*command, "--run-dir", path, "--set", "task=push"), "task = 'push', but the run has 'wall'")
     assert_refused(tandem("train", "push", "--resume=often"), "--resume 'often': choose one of auto, exactly")
 

@@ -104,8 +104,8 @@ def test_a_file_in_millimetres(tmp_path):
     assert_one_line(error.value, "60 x 40 x 30 m", "other units", "scale: 0.001")
     np.testing.assert_allclose(world_with(file, scale=0.001).world.shape.extent_m, (0.06, 0.04, 0.03), atol=1e-6)
     with pytest.raises(ConfigError) as error:
-        world_with(write_box(tmp_path / "cm.obj", (6.0, 4.0, 3.0)))
-    assert_one_line(error.value, "6 x 4 x 3 m", "scale: 0.01 ")
+        world_with(write_box(tmp_path / "cm.obj", (6.0, 5.0, 5.0)))
+    assert_one_line(error.value, "6 x 5 x 5 m", "scale: 0.01 ")
 
 
 def test_a_size_that_is_not_that_of_its_files(tmp_path):
@@ -114,7 +114,10 @@ def test_a_size_that_is_not_that_of_its_files(tmp_path):
     np.testing.assert_allclose(config.world.shape.extent_m, (0.06, 0.04, 0.03), atol=1e-6)
     with pytest.raises(ConfigError) as error:
         world_with(file, overrides=["world.object.size_m=[0.05, 0.04, 0.03]"])
-    assert_one_line(error.value, "size_m = [0.05, 0.04, 0.03]", "have [0.06, 0.04, 0.03]: leave it out")
+    for wrong in ("small", "[a, b, c]", "[0.06, 0.04]", "[0.06, 0.04, null]"):
+        with pytest.raises(ConfigError, match="size_m"):
+            world_with(file, overrides=[f"world.object.size_m={wrong}"])
+    assert_one_line(error.value, "size_m = [0.05, 0.04, 0.03]", "have [0.06, 0.04, 0.03]: leave it out, or give null")
 
 
 def test_it_is_picked_up_carried_and_held(tmp_path):

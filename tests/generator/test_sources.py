@@ -71,7 +71,7 @@ def test_goals_are_its_own_and_in_the_workspace(file):
         (
             "[0.05, 0.05, 0.025], [0.3",
             "[1.05, 0.05, 0.025], [1.3",
-            "while nothing is known; its first is (1.",
+            "while nothing is known, as (1.",
         ),
         ("goal[:, 0])]", "goal[:, None])]", "corner.py: known.near: goal has shape ("),
         ("known.near(", "known.far(", "corner.py:8: AttributeError: "),

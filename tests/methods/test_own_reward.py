@@ -128,9 +128,9 @@ def test_a_class_that_teaches_nothing_of_its_own_is_refused(file, tmp_path):
 
 def test_a_reward_that_needs_a_whole_batch_gets_one(file, tmp_path):
     """As of the nearest of all states in a batch."""
-    whole = "assert len(before) in (8, 16)\n        return self.network(after)"
+    whole = "assert len(before) in (12, 16)\n        return self.network(after)"
     file.write_text(CODE.replace("return self.network(after) -", f"{whole} -"))
-    load_config(None, SMALL).begin(tmp_path, None)
+    load_config(None, [*SMALL, "skills.batch_size=12"]).begin(tmp_path, None)
 
 
 def test_what_the_class_says_is_not_chosen(file):
