@@ -29,26 +29,26 @@ def ahead_words(results: Sequence[Result], composing: str, task: str) -> str:
     steps = [point["env_steps"] for point in of[composing, task][0]["curve"]]
     own, best = _means(of[composing, task], steps), np.max([_means(seeds, steps) for seeds in rivals], axis=0)
     ahead = np.flatnonzero(own - best >= LEVEL)
-    when = f"last after {round(steps[ahead[-1]], -3):,} env steps" if len(ahead) else "never"
     last = round(100 * (rate_of(of[composing, task]).mean - max(rate_of(seeds).mean for seeds in rivals)))
     points = f"{abs(last)} point{'s' * (abs(last) > 1)}"
     end = f"it is {points} {'ahead' if last > 0 else 'behind'}" if last else "they are level"
-    return (
-        f"On *{find_task(task).title}* composing is {100 * LEVEL:.0f} points or more ahead of learning from nothing "
-        f"{when}; at the end {end}."
-    )
+    most, where = f"{100 * LEVEL:.0f} points or more", find_task(task).title
+    if not len(ahead):
+        return f"On *{where}* composing is never {most} ahead of learning from nothing; at the end {end}."
+    when = f"the last time by {most} after {round(steps[ahead[-1]], -3):,} env steps"
+    return f"On *{where}* composing is ahead of learning from nothing, {when}; at the end {end}."
 
 
 def longer_words(longer: Sequence[Result], more_updates: Sequence[Result]) -> str:
     """Where and when learning from nothing becomes good in longer trials, and with more updates: a line for each."""
-    words = []
-    for budget, trials in (("", longer), (f"with {MANY_UPDATES} updates for 64 env steps instead of 8 ", more_updates)):
+    more, words = f"with {MANY_UPDATES} updates for 64 env steps instead of 8, ", list[str]()
+    for budget, trials in (("", longer), (more, more_updates)):
         if places := _good_places(trials):
             words.append(f"{budget}{places}")
     if not words:
         return ""
     most, said = max(each["env_steps"] for each in (*longer, *more_updates)), ";\n".join(words)
-    return f"In trials of {millions(most)} env steps learning from nothing reaches {percent(GOOD)} {said}."
+    return f"In trials of {millions(most)} env steps learning from nothing reaches {percent(GOOD)}: {said}."
 
 
 def without_hindsight_words(results: Sequence[Result]) -> str:
