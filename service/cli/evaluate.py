@@ -314,7 +314,7 @@ def parse_points(option: str, text: str, world: WorldConfig, expected: str) -> S
         TandemError: no points; or one outside of the workspace, inside the table or a fixture, or of objects inside
             each other.
     """
-    from service.envs.sampling import inside_each_other, inside_fixtures, inside_table
+    from service.envs.overlap import inside_each_other, inside_fixtures, inside_table
 
     try:
         points = np.array([[float(part) for part in point.split(",")] for point in text.strip("; ").split(";")])

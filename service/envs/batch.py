@@ -14,10 +14,11 @@ from service.base.types import BoolArray, FloatArray, IntArray, StateArray
 from service.config import WorldConfig
 from service.envs.objects import object_names
 from service.envs.observations import ACTION, COMMAND_PREFIX, Layouts, ObservationLayout, each_object, layouts
+from service.envs.overlap import gripper_boxes, inside_gripper_or_table, join
 from service.envs.randomisation import KEYS, ModelBank, normal
 from service.envs.reach import reach_of
 from service.envs.robot import Robot, described
-from service.envs.sampling import Places, draw_starts, gripper_boxes, inside_gripper_or_table, join
+from service.envs.sampling import Places, draw_starts
 from service.envs.scene import FIXTURE_PREFIX, build_layout
 from service.envs.state_layout import OBSTACLE_PREFIX, object_columns, obstacle_columns, places_at
 

@@ -13,10 +13,7 @@ from service.base.user_code import CodeError, checked, naming_errors_of, place_o
 from service.config.run import SUCCESS_DISTANCE_M
 from service.envs.batch import WorldBatch
 from service.envs.observations import distances, each_object
-from service.envs.sampling import (
-    GoalKind,
-    check_goals,
-    draw_goals,
+from service.envs.overlap import (
     inside_box,
     inside_each_other,
     inside_fixtures,
@@ -24,6 +21,7 @@ from service.envs.sampling import (
     inside_obstacles,
     inside_table,
 )
+from service.envs.sampling import GoalKind, check_goals, draw_goals
 from service.envs.task import Bodies, Task, View
 
 _MAX_DRAWS = 1000

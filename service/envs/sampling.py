@@ -1,26 +1,21 @@
-"""Random places: of object, box and obstacles at a start, clear of each other and of the gripper; and of goals.
-
-Things are as they were described, not turned, so each is in an upright box, and two are clear of each other where their
-boxes are.
-"""
+"""Random places: of object, box and obstacles at a start, clear of each other and of the gripper; and of goals."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple, get_args
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from service.base.errors import ConfigError, TandemError
 from service.base.types import BoolArray, StateArray
 from service.config import WorkspaceConfig, WorldConfig
-from service.config.objects import FixtureConfig, ObjectConfig
+from service.config.objects import ObjectConfig
 from service.config.run import SUCCESS_DISTANCE_M
 from service.envs import scene
-from service.envs.objects import GRIPPER_BIT
 from service.envs.observations import each_object
+from service.envs.overlap import Boxes, boxes_around, boxes_around_fixtures, boxes_of, inside_obstacles, overlaps
 
 GoalKind = Literal["table", "air", "mixed", "volume", "one"]
 GOAL_KINDS: tuple[GoalKind, ...] = get_args(GoalKind)
@@ -30,8 +25,6 @@ _NUM_DRAWS = 20
 """Of the place of one obstacle, or of the object beside a box, before all in a world are drawn anew."""
 _NUM_ARRANGEMENTS = 60
 _MAX_DRAWS = 1000
-_TOUCHES_M = 0.001
-"""An object that stands on a fixture is not inside it, however its place was rounded."""
 _BESIDE_OBJECT_M = np.array([scene.GAP_M, scene.FINGER_GAP_M, scene.GAP_M])
 
 
@@ -48,13 +41,6 @@ class Places(NamedTuple):
     def of(self, worlds: slice | BoolArray | NDArray[np.intp]) -> Places:
         """Those of some worlds."""
         return Places(*(each[worlds] for each in self))
-
-
-class Boxes(NamedTuple):
-    """Upright boxes by two corners, metres: (M, 3) the same in all worlds, or (N, M, 3)."""
-
-    lower: StateArray
-    upper: StateArray
 
 
 # --- starts -----------------------------------------------------------------------------------------------------------
@@ -106,7 +92,7 @@ def draw_starts(rng: np.random.Generator, num: int, config: WorldConfig, gripper
     beside = np.empty((num, len(others), 3))
     left = np.arange(num)
     for _ in range(_NUM_ARRANGEMENTS):
-        clear = ~_overlap(_around(first[left], config.shape), gripper)
+        clear = ~overlaps(boxes_around(first[left], config.shape), gripper)
         if others:
             beside[left], found_place = _place_others(rng, first[left], box[left], others, config, gripper)
             clear &= found_place
@@ -137,9 +123,9 @@ def _place_others(
     gripper: Boxes,
 ) -> tuple[StateArray, BoolArray]:
     """(N, M, 3) random places of all things but the first object and the box; (N,) worlds where all are clear."""
-    num, fixtures = len(first), _around_fixtures(config)
+    num, fixtures = len(first), boxes_around_fixtures(config)
     places, all_clear = np.empty((num, len(others), 3)), np.ones(num, dtype=bool)
-    taken = [_beside(_around(first, config.shape))]
+    taken = [_beside(boxes_around(first, config.shape))]
     if box.size:
         half = np.array([scene.BOX_SIZE_M / 2, scene.BOX_SIZE_M / 2, 0.0])
         taken.append(Boxes(box - half, box + half + [0.0, 0.0, scene.BOX_HEIGHT_M]))
@@ -149,16 +135,16 @@ def _place_others(
         blocked = np.ones(num, dtype=bool)
         for _ in range(_NUM_DRAWS):
             here[blocked] = sample_on_table(rng, int(blocked.sum()), config.workspace, thing.extent_m[2])
-            around = _around(here, thing)
+            around = boxes_around(here, thing)
             beside = Boxes(around.lower - scene.GAP_M, around.upper + scene.GAP_M)
             room_m = _BESIDE_OBJECT_M if index < config.num_objects - 1 else scene.GAP_M
             apart_from = Boxes(around.lower - room_m, around.upper + room_m)
-            blocked = _overlap(beside, gripper) | _overlap(apart_from, fixtures) | _overlap(beside, lying)
+            blocked = overlaps(beside, gripper) | overlaps(apart_from, fixtures) | overlaps(beside, lying)
             if not blocked.any():
                 break
         all_clear &= ~blocked
         places[:, index] = here
-        around = _around(here, thing)
+        around = boxes_around(here, thing)
         taken.append(_beside(around) if index < config.num_objects - 1 else around)
     return places, all_clear
 
@@ -200,6 +186,23 @@ def _beside_boxes(rng: np.random.Generator, box: StateArray, config: WorldConfig
         box[inside] = _on_table(rng, int(inside.sum()), config) * (1.0, 1.0, 0.0)
     raise ConfigError(
         "world.fixture = 'box': no room in the workspace for the object beside the box: make world.workspace larger"
+    )
+
+
+def _clear_of_fixtures(
+    draw: Callable[[int], StateArray], num: int, config: WorldConfig, gap_m: StateArray, shape: ObjectConfig
+) -> StateArray:
+    """(num, 3) centres of an object, each drawn again until it is that far from all described fixtures."""
+    position, fixtures = draw(num), boxes_of(config.fixtures)
+    for _ in range(_MAX_DRAWS):
+        around = boxes_around(position, shape)
+        inside = overlaps(Boxes(around.lower - gap_m, around.upper + gap_m), fixtures)
+        if not inside.any():
+            return position
+        position[inside] = draw(int(inside.sum()))
+    raise ConfigError(
+        f"world.fixtures: the {len(config.fixtures)} of them leave no room for the object in the workspace: take some "
+        "away, or make world.workspace larger"
     )
 
 
@@ -370,137 +373,3 @@ def check_goals(kind: GoalKind, config: WorldConfig, success_distance_m: float =
             f"goals = 'air' in a workspace {config.workspace.height_m:g} m high: they begin at {lowest_m:g} m; "
             "choose table"
         )
-
-
-# --- what is in the way -----------------------------------------------------------------------------------------------
-
-
-def gripper_boxes(model: mujoco.MjModel, data: mujoco.MjData) -> Boxes:
-    """Boxes around what may touch of a gripper, where it is in ``data``."""
-    solid = np.flatnonzero(model.geom_contype == GRIPPER_BIT)
-    turned = data.geom_xmat[solid].reshape(-1, 3, 3)
-    center = data.geom_xpos[solid] + np.einsum("gij,gj->gi", turned, model.geom_aabb[solid, :3])
-    half = np.einsum("gij,gj->gi", np.abs(turned), model.geom_aabb[solid, 3:])
-    return Boxes(center - half, center + half)
-
-
-def inside_obstacles(position: StateArray, obstacles: StateArray, config: WorldConfig) -> BoolArray:
-    """(N,) whether an object at its place of (N, 3 K) would be inside one of the obstacles at (N, M, 3), metres."""
-    half = np.array([each.extent_m for each in config.obstacles]).reshape(-1, 3) / 2
-    others = Boxes(obstacles - half, obstacles + half)
-    return _some_object(position, config, lambda around: _overlap(around, others))
-
-
-def inside_fixtures(position: StateArray, config: WorldConfig) -> BoolArray:
-    """(N,) whether an object at its place of (N, 3 K) would be more than a millimetre inside a fixture or the wall.
-
-    A box, which is elsewhere in every game, is none of them: see ``inside_box``.
-    """
-    fixtures = _around_fixtures(config)
-    return _some_object(position, config, lambda around: _overlap(_smaller(around), fixtures))
-
-
-def inside_box(position: StateArray, box: StateArray, config: WorldConfig, *, bottom: bool) -> BoolArray:
-    """(N,) whether an object at its place of (N, 3 K) would be more than a millimetre inside a side of a box.
-
-    Args:
-        position: metres.
-        box: (N, 3) the middle of its bottom; (N, 0) in worlds without.
-        config: the world.
-        bottom: whether it must not be inside the bottom, either; goals are (``draw_goals``).
-    """
-    if not box.size:
-        return np.zeros(len(position), dtype=bool)
-    parts = scene.BOX_PARTS if bottom else scene.BOX_PARTS[1:]
-    middle, half = (np.array([part[number] for part in parts]) for number in (1, 2))
-    shell = Boxes(box[:, None] + middle - half, box[:, None] + middle + half)
-    return _some_object(position, config, lambda around: _overlap(_smaller(around), shell))
-
-
-def inside_each_other(position: StateArray, config: WorldConfig) -> BoolArray:
-    """(N,) whether objects at their places of (N, 3 K) would be more than a millimetre inside each other."""
-    place, inside = each_object(position), np.zeros(len(position), dtype=bool)
-    around = [_smaller(_around(place[:, index], body)) for index, body in enumerate(config.bodies)]
-    for index, each in enumerate(around[1:], start=1):
-        others = Boxes(*(np.stack(corners, axis=1) for corners in zip(*around[:index], strict=True)))
-        inside |= _overlap(each, others)
-    return inside
-
-
-def inside_table(position: StateArray, config: WorldConfig) -> BoolArray:
-    """(N,) whether an object at its place of (N, 3 K) would be inside the table, however it lies there."""
-    low: BoolArray = each_object(position)[:, :, 2] < np.subtract(config.lowest_heights_m, _TOUCHES_M)
-    inside: BoolArray = np.any(low, axis=1)
-    return inside
-
-
-def inside_gripper_or_table(position: StateArray, config: WorldConfig, gripper: Boxes, rest_m: StateArray) -> BoolArray:
-    """(N,) whether an object at its place of (N, 3 K) would be more than a millimetre inside of these.
-
-    On the table, objects rest at heights of (K,) or (N, K) ``rest_m``.
-    """
-    low = (each_object(position)[:, :, 2] < rest_m - _TOUCHES_M).any(axis=1)
-    inside: BoolArray = low | _some_object(position, config, lambda around: _overlap(_smaller(around), gripper))
-    return inside
-
-
-def _smaller(around: Boxes) -> Boxes:
-    """Boxes that do not reach into what they only touch, however places were rounded."""
-    return Boxes(around.lower + _TOUCHES_M, around.upper - _TOUCHES_M)
-
-
-def _some_object(position: StateArray, config: WorldConfig, test: Callable[[Boxes], BoolArray]) -> BoolArray:
-    """(N,) whether the boxes around one of the objects at (N, 3 K) pass a test."""
-    place = each_object(position)
-    tested = [test(_around(place[:, index], body)) for index, body in enumerate(config.bodies)]
-    return tested[0] if len(tested) == 1 else np.any(tested, axis=0)
-
-
-def _clear_of_fixtures(
-    draw: Callable[[int], StateArray], num: int, config: WorldConfig, gap_m: StateArray, shape: ObjectConfig
-) -> StateArray:
-    """(num, 3) centres of an object, each drawn again until it is that far from all described fixtures."""
-    position, fixtures = draw(num), _boxes_of(config.fixtures)
-    for _ in range(_MAX_DRAWS):
-        around = _around(position, shape)
-        inside = _overlap(Boxes(around.lower - gap_m, around.upper + gap_m), fixtures)
-        if not inside.any():
-            return position
-        position[inside] = draw(int(inside.sum()))
-    raise ConfigError(
-        f"world.fixtures: the {len(config.fixtures)} of them leave no room for the object in the workspace: take some "
-        "away, or make world.workspace larger"
-    )
-
-
-def _around(position: StateArray, shape: ObjectConfig) -> Boxes:
-    """(N, 3) boxes around a thing at (N, 3) places."""
-    half = np.array(shape.extent_m) / 2
-    return Boxes(position - half, position + half)
-
-
-def _around_fixtures(config: WorldConfig) -> Boxes:
-    """Boxes around all fixtures that are described, or around the wall."""
-    if config.fixture != "wall":
-        return _boxes_of(config.fixtures)
-    workspace = config.workspace
-    half = np.array([scene.WALL_THICKNESS_M, workspace.length_y_m, 2 * scene.WALL_HEIGHT_M]) / 2
-    middle = np.array([[workspace.center_x_m, workspace.center_y_m, 0.0]])
-    return Boxes(middle - half, middle + half)
-
-
-def _boxes_of(fixtures: Sequence[FixtureConfig]) -> Boxes:
-    corners = np.array([each.corners_m for each in fixtures]).reshape(-1, 2, 3)
-    return Boxes(corners[:, 0], corners[:, 1])
-
-
-def join(one: Boxes, other: Boxes) -> Boxes:
-    """All boxes of both."""
-    return Boxes(*(np.concatenate(pair) for pair in zip(one, other, strict=True)))
-
-
-def _overlap(one: Boxes, others: Boxes) -> BoolArray:
-    """(N,) whether (N, 3) boxes overlap one of ``others``."""
-    overlapping = (one.lower[:, None] < others.upper) & (one.upper[:, None] > others.lower)
-    some: BoolArray = np.any(np.all(overlapping, axis=-1), axis=1)
-    return some

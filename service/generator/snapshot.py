@@ -14,7 +14,8 @@ from service.base.types import Array, Arrays, BoolArray, IntArray, StateArray
 from service.config import WorldConfig
 from service.config.self_play import GOAL_SOURCES, SelfPlayConfig
 from service.envs.observations import distances, each_object
-from service.envs.sampling import are_apart, inside_obstacles, sample_goals
+from service.envs.overlap import inside_obstacles
+from service.envs.sampling import are_apart, sample_goals
 from service.envs.state_layout import places_at
 from service.generator.bins import AIR_ABOVE_REST_M, GoalCells, TaskBins, highest, in_air
 from service.generator.opponents import RoundPlan

@@ -16,7 +16,8 @@ from service.base.user_code import CodeError, check_members, checked, find_class
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
 from service.envs.observations import each_object
-from service.envs.sampling import GoalKind, check_goals, inside_each_other, inside_fixtures, sample_goals
+from service.envs.overlap import inside_each_other, inside_fixtures
+from service.envs.sampling import GoalKind, check_goals, sample_goals
 from service.generator.validity import in_workspace
 
 NUM_DRAWN = 1024

@@ -10,8 +10,9 @@ from service.base.errors import ConfigError
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import distances, each_object, layouts
+from service.envs.overlap import inside_fixtures
 from service.envs.rules import Rules
-from service.envs.sampling import GOAL_KINDS, are_apart, draw_goals, inside_fixtures, sample_goals
+from service.envs.sampling import GOAL_KINDS, are_apart, draw_goals, sample_goals
 from service.envs.task import Task
 from tests.envs.scripted import CLOSE, OPEN, drive
 from tests.envs.test_obstacles import put, touching

@@ -10,7 +10,7 @@ from service.config import parse_config
 from service.config.distillation import DistillationConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import BOB, PAPER, POSITIONS, layouts
-from service.envs.sampling import inside_obstacles
+from service.envs.overlap import inside_obstacles
 from service.learner.distillation import Distiller
 from service.learner.transfer import BOB_INPUTS, take_over
 from service.methods.distillation import Distillation

@@ -7,7 +7,8 @@ import pytest
 from service.base.errors import RobotError, TandemError
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
-from service.envs.sampling import draw_first, draw_goals, inside_gripper_or_table
+from service.envs.overlap import inside_gripper_or_table
+from service.envs.sampling import draw_first, draw_goals
 from service.envs.task import Task
 from service.registry.bundled import BUNDLED
 from service.registry.loading import load

@@ -17,8 +17,8 @@ from service.base.types import BoolArray, FloatArray, StateArray
 from service.config import WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import ACTION, each_object, layouts
+from service.envs.overlap import inside_each_other, inside_fixtures
 from service.envs.rules import Rules
-from service.envs.sampling import inside_each_other, inside_fixtures
 from service.envs.task import Task, View, view_of_places
 from service.envs.tasks import find_task
 

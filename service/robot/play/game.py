@@ -15,8 +15,8 @@ from service.base.types import FloatArray, StateArray
 from service.config.self_play import GameConfig, SelfPlayConfig
 from service.envs.batch import WorldBatch
 from service.envs.observations import bob_observation, distances, each_object
+from service.envs.overlap import inside_each_other, inside_fixtures
 from service.envs.rules import Rules
-from service.envs.sampling import inside_each_other, inside_fixtures
 from service.generator.validity import FALLEN_BELOW_M, NO_GOAL, Verdict, classify_goal, proposed
 from service.policies.numpy_policy import NumpyMCPPolicy
 from service.registry.loading import Trained
