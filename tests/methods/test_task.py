@@ -288,12 +288,16 @@ def test_a_policy_from_nothing_needs_the_world_alone(home, champion, observation
     assert acted(found, observation).shape == (2, 3, 4)
     for wrong, said in (
         (observation[:1], r"1 rows, and 3 in the step before: call begin\(\)"),
-        (observation[0], "shape"),
+        (observation[0], r"1 rows, and 3 in the step before"),
+        (observation[None], "shape"),
     ):
         with pytest.raises(TandemError, match=said):
             found.act_deterministic(wrong)
     found.begin()
-    assert found.act_deterministic(observation[:1]).shape == (1, 4)
+    one = found.act_deterministic(observation[:1])
+    found.begin()
+    np.testing.assert_array_equal(found.act_deterministic(observation[0]), one[0])
+    assert one.shape == (1, 4)
     assert "acts with nothing else" in refused(
         home / "runs" / "scratch-monolithic", tmp_path, primitives="panda-cube@champion"
     )
