@@ -239,7 +239,7 @@ def draw_table(results: Sequence[Result], path: Path) -> Path:
     tasks = [name for name in TASKS if name in run]
     rows = max(1, math.ceil(len(tasks) / 3))
     legend_rows = max(1, math.ceil(len({method for method, _ in of}) / _LEGEND_COLUMNS))
-    above_inch = 1.0 + 0.22 * legend_rows
+    above_inch = 1.15 + 0.22 * legend_rows
     height_inch = above_inch + 0.5 + 3.1 * rows
     figure = new_figure(14.0, height_inch, "Success at the last step, over thousands of env steps")
     longest = max((each["env_steps"] for each in results), default=0) / 1e3
@@ -257,7 +257,7 @@ def draw_table(results: Sequence[Result], path: Path) -> Path:
         axes.set_ylim(-0.02, 1.02)
         axes.set_xlim(0.0, 1.02 * longest or 1.0)
     titles = [described.title for described in TASK_METHODS.values() if described.title in lines]
-    anchor = (0.015, 1 - 0.5 / height_inch)  # under the title
+    anchor = (0.015, 1 - 0.65 / height_inch)  # under the title
     figure.legend(
         [lines[title] for title in titles],
         titles,
