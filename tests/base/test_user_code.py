@@ -1,6 +1,7 @@
 """Files of users: how they are named, what is run of them, and how their mistakes are told."""
 
 import sys
+from contextlib import nullcontext
 
 import pytest
 
@@ -9,6 +10,7 @@ from service.base.user_code import (
     CodeError,
     Reference,
     changed_since,
+    check_members,
     find,
     naming_errors_of,
     parse_reference,
@@ -126,6 +128,26 @@ def test_a_file_that_ends_the_program_is_told_as_any_error():
     with pytest.raises(CodeError) as error:
         found_in("import sys\nN = 1\nsys.exit(0)\n")
     assert_one_line(error.value, "numbers.py:3: SystemExit: 0")
+
+
+class Base:
+    def step(self): ...
+    def measure(self): ...
+
+
+@pytest.mark.parametrize(
+    ("members", "said"),
+    [
+        ("steps = 3\n    def step(self): ...", None),  # beside the member that it is like
+        ("_measur = 3", None),
+        ("paid = 3", None),
+        ("measur = 3", "Mine.measur is no member of Base; did you mean 'measure'?"),
+    ],
+)
+def test_a_misspelt_member_is_none_that_is_merely_alike(members, said):
+    text = f"from tests.base.test_user_code import Base\nclass Mine(Base):\n    {members}"
+    with pytest.raises(CodeError, match=said) if said else nullcontext():
+        check_members(run("mine.py", text).Mine, Base, ("step", "measure"))
 
 
 def test_what_a_file_prints_is_no_output_of_the_command(capsys):

@@ -69,6 +69,16 @@ def test_dads_by_hand():
     np.testing.assert_allclose(found, math.log(8) - np.log(1 + total), atol=1e-5)
 
 
+def test_dads_pays_a_large_batch_as_its_parts():
+    """All transitions are compared with the same alternatives, however many are predicted at once."""
+    rows = torch.randn((70, 8), generator=torch.Generator().manual_seed(1)).split((3, 3, 2), dim=1)
+    paid = make("dads", num_alternatives=5).rewards(*rows)
+    for first in (0, 31, 32, 64, 69):
+        alone = make("dads", num_alternatives=5).rewards(*(each[first : first + 1] for each in rows))
+        np.testing.assert_allclose(paid[first], alone[0], rtol=1e-5)
+    assert len(paid) == 70
+
+
 def test_dads_clips_what_is_certain():
     reward = make("dads", num_alternatives=1)
     reward._log_prob = lambda state, change, skill: torch.full(state.shape[:-1], -300.0 if state.dim() == 3 else 0.0)

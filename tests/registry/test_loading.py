@@ -308,6 +308,7 @@ def test_a_version_of_a_kind_that_is_not_known(registry):
         ("nobody", ["no 'nobody'", "it holds: tiny", "with tandem comes: panda-cube"]),
         ("no/such/run", ["no/such/run", "no such directory of a run", "NAME@ALIAS"]),
         ("Tiny!", ["bad reference 'Tiny!'"]),
+        ("lift.py:LIFT", ["lift.py:LIFT is code", "name a task by --task lift.py:LIFT"]),
     ],
 )
 def test_nobody_there(registry, reference, parts):

@@ -34,6 +34,22 @@ def envs():
     envs.close()
 
 
+@pytest.mark.parametrize(
+    ("world", "lowest_m"),
+    [
+        ({}, 0.025),
+        ({"object": {"shape": "box", "size_m": (0.04, 0.04, 0.1)}}, 0.02),  # it may lie on its side
+        ({"randomisation": {"object_size": (0.8, 1.2), "table_height_m": (-0.01, 0.02)}}, 0.8 * 0.025 - 0.01),
+    ],
+)
+def test_a_goal_is_no_lower_than_an_object_can_lie(world, lowest_m):
+    env = TabletopEnv(WorldConfig.model_validate(CONFIG.model_dump() | world))
+    env.reset(seed=0, options={"goal": (0.0, 0.0, lowest_m)})
+    with pytest.raises(TandemError, match="out of reach"):
+        env.reset(options={"goal": (0.0, 0.0, lowest_m - 0.002)})
+    env.close()
+
+
 def test_a_goal_is_given_at_a_reset_and_nothing_else_changes(env):
     drawn, _ = env.reset(seed=3)
     following, _ = env.reset()
