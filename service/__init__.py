@@ -93,10 +93,10 @@ def train(
     Raises:
         TandemError: a setting, a file or a directory that cannot be used.
     """
-    from service.cli.configs import named
     from service.config import load_config
     from service.config.recipes import DEFAULT_RECIPE, recipes
     from service.runs import train as training
+    from service.runs.named import named
     from service.runs.resuming import resumed_config
     from service.store.run_directory import RunDirectory
 

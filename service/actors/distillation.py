@@ -10,7 +10,6 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from service.base.liveness import count_work
 from service.base.types import BoolArray, FloatArray, IntArray, StateArray
 from service.config.distillation import DistillingConfig
 from service.envs.batch import WorldBatch
@@ -120,7 +119,6 @@ class DistillationWorlds:
         noisy = rng.random((len(action), 1)) < _NOISY_SHARE
         noise = how.action_noise * rng.standard_normal(action.shape, dtype=np.float32)
         worlds.step(action + np.where(noisy, noise, np.float32(0.0)))
-        count_work()
         return answer
 
 

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.actors.rollout import Demonstrations, Rollout, Turns, join_demonstrations
-from service.base.liveness import count_work
 from service.base.types import Arrays, BoolArray, FloatArray, IntArray, Metrics, StateArray
 from service.config.self_play import SelfPlayConfig
 from service.envs.batch import WorldBatch
@@ -208,7 +207,6 @@ class SelfPlay:
             )
             turns.observation[step], turns.action[step], turns.log_prob[step] = observation, action, log_prob
             diverged |= worlds.step(action[~diverged], np.flatnonzero(~diverged))
-            count_work()
             if observe:
                 observe(worlds.states)
             contacts |= worlds.contacts()
@@ -228,7 +226,7 @@ class SelfPlay:
         no_world = np.zeros(num, dtype=bool)
         size = self.worlds.observed.full.size
         turns = _empty_turns(self.config.game.alice_steps, num, size, size, learn=no_world)
-        return turns, np.zeros((num, 2), dtype=bool), no_world
+        return turns, np.zeros((num, 2 * self.config.world.num_objects), dtype=bool), no_world
 
     def _play_bob(
         self, players: Players, plan: RoundPlan, choice: GoalChoice, observe: StateObserver | None
@@ -264,7 +262,6 @@ class SelfPlay:
             turns.value_observation[step, playing] = worlds.bob_value(choice.goal)[playing]
             turns.log_prob[step, playing], turns.active[step, playing] = log_prob, True
             diverged |= worlds.step(action, playing)
-            count_work()
             if observe:
                 observe(worlds.states)
             self._count_reached(playing[~diverged[playing]])

@@ -17,7 +17,7 @@ from service.cli.common import JsonOption, print_json, print_table
 
 _EXTRAS = {
     "play": "viser", "serve": "fastapi", "cluster": "ray", "downstream": "stable_baselines3", "export": "onnx",
-    "data": "minari",
+    "data": "minari", "pybullet": "pybullet", "franka": "franky",
 }  # fmt: skip
 """Packages by the extras that bring them."""
 _LEAST_GB = 2.0

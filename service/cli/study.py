@@ -11,7 +11,6 @@ import typer
 
 from service.base.errors import ConfigError, TandemError, one_line
 from service.cli.common import REGISTRY, how_to_go_on, loading, print_table, shown, stopped, traceback_in
-from service.cli.configs import is_task, named
 from service.config import Config, load_config
 from service.config.find import METHODS
 from service.config.recipes import DEFAULT_RECIPE, recipes
@@ -19,6 +18,7 @@ from service.config.task_methods import TASK_METHODS
 from service.envs.tasks import PAPERS
 from service.registry.names import is_service
 from service.runs.grid import SEED, Settings, check_once, name_runs, parse_grid
+from service.runs.named import is_task, named
 from service.runs.progress import Progress
 from service.runs.resuming import resumed_config
 from service.runs.signals import InterruptError, StopSignals

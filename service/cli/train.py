@@ -28,11 +28,11 @@ from service.cli.common import (
     typed_options,
     was_typed,
 )
-from service.cli.configs import named, targets
 from service.cli.study import is_study, train_study
 from service.config import Config, load_config
 from service.config.recipes import DEFAULT_RECIPE, recipes
 from service.registry.token import read_token
+from service.runs.named import named, targets
 from service.runs.progress import Progress
 from service.runs.resuming import resumed_config
 from service.runs.signals import InterruptError

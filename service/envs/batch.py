@@ -10,6 +10,7 @@ import numpy as np
 from mujoco import rollout
 
 from service.base.errors import ConfigError, DivergedError
+from service.base.liveness import count_work
 from service.base.types import BoolArray, FloatArray, IntArray, StateArray
 from service.config import WorldConfig
 from service.envs.objects import object_names
@@ -239,6 +240,7 @@ class WorldBatch:
         index = slice(None) if worlds is None else worlds
         if worlds is not None and not worlds.size:
             return np.zeros(self.num_worlds, dtype=bool)  # MuJoCo's rollout of no states is a segmentation fault
+        count_work()
         start = self.states[index]
         if actions.shape != (start.shape[0], ACTION.size):
             raise ValueError(f"actions: expected shape {(start.shape[0], ACTION.size)}, got {actions.shape}")

@@ -48,13 +48,13 @@ class GoalRecords:
     start_position: StateArray
     """(N, 3 K) positions of the objects there, metres."""
     goal: StateArray
-    """(N, 3 K) the goal Bob played, metres: Alice's proposal, or a replayed goal where ``replayed``."""
+    """(N, 3 K) the goal Bob played, metres: Alice's proposal, or another where ``replayed``."""
     proposal: StateArray
     """(N, 3 K) positions at the end of Alice's turn, metres; those of its start of what she did not move."""
     verdict: NDArray[np.int8]
     """(N,) ``Verdict`` of Alice's proposal."""
     replayed: BoolArray
-    """(N,) Bob played a goal from the replay buffer (``start_state`` is then that goal's own)."""
+    """(N,) Bob played a goal of the goal source, not hers of now; one that was hers has its own ``start_state``."""
     from_reset: BoolArray
     """(N,) Bob started where a game does, as he does whenever he is evaluated."""
     played: BoolArray

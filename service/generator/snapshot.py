@@ -41,7 +41,7 @@ class GoalChoice:
     start_position: StateArray
     """(N, 3 K) positions of the objects there, metres."""
     replayed: BoolArray
-    """(N,) the goal and its start come from the buffer, not from this round's Alice."""
+    """(N,) the goal is one of the goal source, not this round's Alice's; one that was hers before has its own start."""
     from_reset: BoolArray
     """(N,) the start is that of a game."""
     played: BoolArray
@@ -169,7 +169,7 @@ class GeneratorSnapshot:
         return replace(self, **arrays, buffer=parts["buffer"], starts=parts["starts"], held_starts=parts["held_starts"])
 
     def _choose_replayed(self, valid: BoolArray, bob_past: BoolArray, rng: np.random.Generator) -> BoolArray:
-        """(N,) worlds whose goal comes from the buffer."""
+        """(N,) worlds whose goal comes from the goal source."""
         config = self.config.generator
         if config.goal_source == "alice" and len(self.buffer["goal"]) < MIN_REPLAY_GOALS:
             return np.zeros(len(valid), dtype=np.bool_)

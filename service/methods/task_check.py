@@ -37,9 +37,7 @@ def check_fits(method: TaskMethod, trained: Trained) -> None:
         )
     if method.takes is not None:
         trained.expect(method.takes, by=f"the method {method.title}")
-    check_robot(trained)
-    if method.composes:
-        check_primitives(trained)
+    (check_primitives if method.composes else check_robot)(trained)
     if method.skills is not None and (found := trained.skills.method) != method.skills:
         hint = "; any-skills takes all" * method.learns
         raise TandemError(f"{trained.label} holds skills of {found}, this method takes those of {method.skills}{hint}")

@@ -32,8 +32,8 @@ URL_VARIABLE, REGISTRY_VARIABLE = "TANDEM_URL", "TANDEM_REGISTRY"
 _TIMEOUT = httpx.Timeout(20.0, connect=5.0)
 
 
-def fetch_primitives(url: str, reference: str, *, cache_dir: Path | None = None) -> tuple[Registry, Version]:
-    """Fetch a version from a status service.
+def fetch_primitives(url: str, reference: str) -> tuple[Registry, Version]:
+    """Fetch a version from a status service into ``~/.cache/tandem/registries``.
 
     An alias is resolved by the service each time; parameters are fetched only once. The token of ``TANDEM_TOKEN`` is
     sent only to the service that ``TANDEM_URL`` or ``TANDEM_REGISTRY`` names.
@@ -41,7 +41,6 @@ def fetch_primitives(url: str, reference: str, *, cache_dir: Path | None = None)
     Args:
         url: URL of the service, such as ``http://lab:8321``.
         reference: NAME, NAME@VERSION or NAME@ALIAS.
-        cache_dir: directory of fetched registries; None for ``~/.cache/tandem/registries``.
 
     Returns:
         A registry on this machine that has the version, and the version: ``registry.load(str(version))``.
@@ -57,7 +56,7 @@ def fetch_primitives(url: str, reference: str, *, cache_dir: Path | None = None)
     name, target = split_reference(reference)
     directory = hashlib.sha256(base.encode()).hexdigest()[:16]  # one for each service: two may both have a version 1
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tandem" / "registries"
-    registry = Registry((cache_dir or caches) / directory)
+    registry = Registry(caches / directory)
     configured = {os.environ.get(variable, "").rstrip("/") for variable in (URL_VARIABLE, REGISTRY_VARIABLE)}
     token = read_token() if base in configured else None  # it is for this service, not for any URL
     headers = {"Authorization": f"Bearer {token}"} if token else {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from threading import Event, Lock, Thread
 from types import TracebackType
@@ -14,12 +14,14 @@ from service.base.errors import RunTakenError
 from service.base.liveness import work_done
 from service.config import Config
 from service.config.task import TaskConfig
+from service.methods.method import Health
 from service.runs.run import Run
 from service.store.models import CONDITIONS, RunState, RunStatus, RunTotals, Trial
+from service.store.run_directory import RunDirectory
 from service.store.run_writer import RunWriter
 
 BEAT_S = 2.0
-"""Time between two heartbeats of what follows learning."""
+"""Time between two heartbeats of the thread that sends them."""
 GOALS_INTERVAL_S = 5.0
 """Time between two grids of goals."""
 _MEASURED = {
@@ -66,6 +68,8 @@ class Report:
         self._writer, self._lock = writer, Lock()
         self._totals = previous.totals.model_dump() if previous is not None else {}
         self._counted: dict[str, int] = {}
+        self._warnings: tuple[str, ...] = ()
+        """Of the run's method."""
         self._gridded_s = float("-inf")
         now, trial = datetime.now(UTC), None
         if isinstance(config, TaskConfig):
@@ -114,16 +118,18 @@ class Report:
             self._writer.close()
 
     @contextmanager
-    def beating(self) -> Iterator[None]:
-        """Tell in a block that takes long that the run is alive, for as long as its work goes on (``liveness``)."""
+    def beating(self, directory: RunDirectory) -> Iterator[None]:
+        """Tell in a block, whatever it waits for, that the run is alive while its work goes on (``liveness``)."""
         over = Event()
 
         def beat() -> None:
             done = work_done()
-            while not over.wait(BEAT_S):
-                if (now := work_done()) != done:
-                    done = now
-                    self.alive()
+            with suppress(RunTakenError):  # the block finds that out, too
+                while not over.wait(BEAT_S):
+                    if (now := work_done()) != done:
+                        done = now
+                        directory.check_owner()
+                        self.alive()
 
         thread = Thread(target=beat, name="heartbeat", daemon=True)
         thread.start()
@@ -136,7 +142,7 @@ class Report:
     def begin(self, run: Run) -> None:
         """Say that the run begins, or goes on where it was."""
         self._status = self._status.model_copy(update={"state": "running", "trial": self._trial})
-        self._counted = self._counters(run)  # where it goes on is no work of this process
+        self._counted = self._counters(run, run.method.health())  # where it goes on is no work of this process
         if not self._totals:  # of earlier ones nothing is known but how far they came
             self._totals = {name: self._counted[name] for name in ("iterations", "env_steps")}
         self.beat(run)
@@ -149,23 +155,26 @@ class Report:
             self._gridded_s = time.monotonic()
             if (grid := run.method.grid()) is not None:
                 self._writer.goals(grid)
-        self._status = self._status.model_copy(
-            update={
-                "env_steps_per_s": metrics["time/env_steps_per_s"],
-                "policy_version": int(metrics.get("learner/version", self._status.policy_version)),
-                "policy_lag": metrics.get("learner/policy_lag", 0.0),
-            }
+        self.beat(
+            run,
+            env_steps_per_s=metrics["time/env_steps_per_s"],
+            policy_version=int(metrics.get("learner/version", self._status.policy_version)),
+            policy_lag=metrics.get("learner/policy_lag", 0.0),
         )
-        self.beat(run)
 
-    def beat(self, run: Run) -> None:
+    def beat(self, run: Run, **changes: Any) -> None:
         """Tell that the run is alive, how far it is, and how its parts are; stop it where that was asked for.
+
+        Args:
+            run: it.
+            changes: of its status, beside these.
 
         Raises:
             RunTakenError: another process has taken it over.
         """
         run.directory.check_owner()
-        health, counters = run.method.health(), self._counters(run)
+        health = run.method.health()
+        counters = self._counters(run, health)
         for name, value in counters.items():
             self._totals[name] = self._totals.get(name, 0) + max(0, value - self._counted.get(name, 0))
         self._counted = counters
@@ -182,6 +191,7 @@ class Report:
             actors=health.actors,
             last_error=health.last_error,
             warnings=health.warnings,
+            **changes,
         )
 
     def alive(self) -> None:
@@ -202,9 +212,8 @@ class Report:
         self._tell(state=state, stopping=False, published=published, last_error=error or self._status.last_error)
 
     @staticmethod
-    def _counters(run: Run) -> dict[str, int]:
+    def _counters(run: Run, health: Health) -> dict[str, int]:
         """What this process counts now; it falls where the run goes back to a checkpoint."""
-        health = run.method.health()
         return {
             "iterations": run.iteration,
             "env_steps": run.num_env_steps,
@@ -217,7 +226,8 @@ class Report:
         with self._lock:  # ``beating`` has a thread of its own
             troubles = self._writer.troubles()
             condition = max((each.condition for each in troubles), key=CONDITIONS.index, default="well")
-            warnings = (*(each.text for each in troubles), *changes.pop("warnings", ()))
+            self._warnings = changes.pop("warnings", self._warnings)
+            warnings = (*(each.text for each in troubles), *self._warnings)
             changes |= {"heartbeat": datetime.now(UTC), "condition": condition, "warnings": warnings}
             self._status = self._status.model_copy(update=changes)
             self._writer.status(self._status)

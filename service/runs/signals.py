@@ -8,8 +8,11 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from threading import current_thread, main_thread
 from types import FrameType, TracebackType
 from typing import Self
+
+from service.base.errors import TandemError
 
 PASSED_ON = signal.SIGUSR1
 """A stop that the process above passes on. It counts only where no other signal came: a supervisor, such as Ray's for
@@ -51,6 +54,10 @@ class StopSignals:
         self._previous = {number: handler for number, handler in before.items() if not _is_ignored(number, handler)}
 
     def __enter__(self) -> Self:
+        if current_thread() is not main_thread():
+            raise TandemError(
+                "training needs the main thread, as no other gets signals: call it there, or in a process of its own"
+            )
         for number in self._previous:
             signal.signal(number, self._handle)
         return self

@@ -250,11 +250,11 @@ def _run(
         answer("stopping after this iteration; again to end now")
 
     report.begin(run)
-    with signals.asking(stop):
+    with signals.asking(stop), report.beating(run.directory):
         reason = run.run(tell, partial(report.beat, run))
     done = Finished(reason, run.iteration, run.num_env_steps, run.method.timing.tree())
     if reason != "interrupted" and signals.first is None:
-        with suppress(InterruptError), report.beating():
+        with suppress(InterruptError), report.beating(run.directory):
             done = _finish(done, run, registry, publish, report)
     complete = reason if signals.first is None else "interrupted"  # --resume does what is left
     report.end(cast(RunState, complete), published=str(done.version) if done.version is not None else None)

@@ -1,1 +1,1 @@
-"""The status service: REST, /metrics, the web page, and the client that fetches primitives. No torch, no Ray."""
+"""The status service: REST, /metrics and the web page. No torch, no Ray."""

@@ -29,7 +29,6 @@ RUN_FILES = {
 """Title and media type of the files of a run directory that are served; all others are not."""
 OLDER = re.compile(r"(rounds|skills|episodes)-[0-9]{8}T[0-9]{6}\.mp4")
 """Name of a recording that a newer one has replaced."""
-MAX_RECORDINGS = 50
 BYTES = {"schema": {"type": "string", "format": "binary"}}
 """The content of a file in the OpenAPI document."""
 PARTS: dict[int | str, dict[str, Any]] = {
@@ -109,7 +108,7 @@ class RunDirectories:
         paths = {name: directory / name for name in RUN_FILES}
         with suppress(OSError):  # most runs have no older recordings
             older = sorted((directory / RECORDINGS).iterdir(), reverse=True)
-            paths |= {path.name: path for path in older[:MAX_RECORDINGS] if OLDER.fullmatch(path.name)}
+            paths |= {path.name: path for path in older if OLDER.fullmatch(path.name)}
         return {name: path for name, path in paths.items() if os.path.isfile(path) and not os.path.islink(path)}
 
 

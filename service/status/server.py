@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import logging
-import signal
 import socket
 import threading
 import time
@@ -15,6 +14,7 @@ import uvicorn
 from service.base.errors import StatusError
 from service.base.ports import DEFAULT_PORT, listen, url_of
 from service.registry.registry import Registry
+from service.runs.signals import StopSignals
 from service.status.app import create_app
 from service.status.auth import is_loopback
 from service.store.models import RunReader
@@ -26,6 +26,7 @@ MAX_CONNECTIONS = 512
 MAX_HEAD_BYTES = 64 * 1024
 """Request line and headers; a browser's have one or two kilobytes."""
 _GRACE_S = 2
+_POLL_S = 0.2
 _logger = logging.getLogger(__name__)
 
 
@@ -99,23 +100,20 @@ class StatusServer:
         self._socket.close()
 
     def run(self) -> None:
-        """Serve in the foreground until SIGINT or SIGTERM; only in the main thread.
+        """Serve in the foreground until a signal that ends a run, too; only in the main thread.
 
         Raises:
             StatusError: it does not start, or ends by itself.
         """
-        stop_requested = threading.Event()
-        numbers = (signal.SIGINT, signal.SIGTERM)
-        previous = [signal.signal(number, lambda *_: stop_requested.set()) for number in numbers]
-        try:
-            self.start()
-            while not stop_requested.wait(1.0):
-                if not self._thread.is_alive():
-                    raise StatusError(f"the status service at port {self.port} ended by itself; the log says why")
-        finally:
-            self.stop()
-            for number, handler in zip(numbers, previous, strict=True):
-                signal.signal(number, handler)
+        with StopSignals() as signals, signals.asking(lambda: None):
+            try:
+                self.start()
+                while signals.first is None:
+                    self._thread.join(_POLL_S)
+                    if not self._thread.is_alive():
+                        raise StatusError(f"the status service at port {self.port} ended by itself; the log says why")
+            finally:
+                self.stop()
 
     def __enter__(self) -> StatusServer:
         self.start()

@@ -125,4 +125,5 @@ class RunWriter:
             path = self._directory.path / name
             with self._directory.keep_running(path):
                 write_atomic(path, content.model_dump_json().encode() + b"\n", flush=False)
-                self._waiting.pop(name, None)  # a heartbeat's thread may have written it, too
+                if self._waiting.get(name) is content:  # a thread beside this one may have left a newer one
+                    del self._waiting[name]

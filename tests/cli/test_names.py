@@ -18,10 +18,10 @@ from service.base.errors import TandemError, did_you_mean
 from service.base.progress import Display
 from service.base.version import __version__
 from service.cli.common import quieten
-from service.cli.configs import named
 from service.cli.main import app
 from service.config import load_config
 from service.config.recipes import CONFIGS, recipes, robots
+from service.runs.named import named
 from service.store.run_log import logging_to, read_log
 from tests.cli.typed import assert_refused, tandem
 
@@ -82,6 +82,7 @@ def test_configs_are_listed_and_shown():
     ("arguments", "said"),
     [
         (["configs", "show", "panda_cube"], "did you mean 'panda-cube'?"),
+        (["train", "--method", "paper"], "method = 'paper': choose one of "),  # which a recipe has in its name
         (["pretrain", "--config", "panda-cub"], "no recipe, task or file of that name; there are panda-cube, "),
         (["pretrain", "--set", "world.robot=ur5"], "did you mean 'ur5e'?"),
         (["pretrain", "--set", "learner.bob.num_epoch=3"], "did you mean 'num_epochs'?"),

@@ -13,6 +13,8 @@ import pytest
 from service.base import lock
 from service.base.errors import DivergedError, RunTakenError, StoreUnavailableError, TandemError
 from service.base.lock import claim_epoch
+from service.config import WorldConfig
+from service.envs.batch import WorldBatch
 from service.methods.self_play import LocalSelfPlay, SelfPlay
 from service.registry.registry import Registry
 from service.runs import report
@@ -83,6 +85,31 @@ def test_a_run_whose_workers_start_for_long_is_alive(tmp_path, monkeypatch):
     run(tmp_path)
     assert [each.state for each in seen] == ["starting"] * 3
     assert seen[0].heartbeat < seen[1].heartbeat < seen[2].heartbeat
+
+
+def test_an_iteration_that_takes_long_is_alive_while_its_worlds_go_on(tmp_path, monkeypatch):
+    """As one of a task may take minutes: its iteration has thousands of updates."""
+    step, stood = LocalSelfPlay.step, []
+
+    def step_slowly(method):
+        before = status(tmp_path)
+        time.sleep(0.1)  # many beats
+        stood.append(status(tmp_path).heartbeat == before.heartbeat)
+
+        def stepped():
+            with WorldBatch(WorldConfig(), 1) as worlds:
+                worlds.step(np.zeros((1, 4), np.float32))
+            return status(tmp_path).heartbeat > before.heartbeat
+
+        wait_until(stepped)
+        return step(method)
+
+    monkeypatch.setattr(LocalSelfPlay, "step", step_slowly)
+    monkeypatch.setattr(report, "BEAT_S", 0.01)
+    monkeypatch.setattr(run_writer, "STATUS_INTERVAL_S", 0.0)
+    run(tmp_path)
+    assert stood
+    assert stood[0]  # nothing was stepped then: as where a run hangs
 
 
 def test_a_run_tells_how_far_it_is_and_how_it_ended(tmp_path):

@@ -3,17 +3,19 @@
 import os
 import pty
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from types import SimpleNamespace
 
 import pytest
 
+from service.base.errors import TandemError
 from service.registry.registry import Registry
 from service.runs import train as training
 from service.runs.run import Run
 from service.runs.signals import PASSED_ON, STOPPING, InterruptError, StopSignals
 from tests.cli.typed import tandem
-from tests.runs.runs import assert_same_run, newest, play, write_yaml
+from tests.runs.runs import assert_one_line, assert_same_run, newest, play, write_yaml
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
@@ -93,6 +95,12 @@ def test_after_the_question_a_signal_raises_again():
             pass
         with pytest.raises(InterruptError):
             send(signal.SIGINT)
+
+
+def test_another_thread_gets_no_signals_and_is_told_so():
+    with ThreadPoolExecutor(1) as threads, pytest.raises(TandemError) as error:
+        threads.submit(StopSignals().__enter__).result()
+    assert_one_line(error.value, "training needs the main thread", "in a process of its own")
 
 
 def test_a_signal_that_somebody_swallowed_is_not_forgotten():

@@ -99,7 +99,7 @@ def blob_path(answers):
 
 @pytest.mark.parametrize(("reference", "number"), [("tiny", 2), ("tiny@champion", 1)])
 def test_a_fetched_version_is_complete(server, home, tmp_path, reference, number):
-    registry, version = fetch_primitives(server.url, reference, cache_dir=tmp_path)
+    registry, version = fetch_primitives(server.url, reference)
     assert version == ("tiny", number)
     own = Registry(home / "registry")
     assert registry.manifest(str(version)) == own.manifest(f"tiny@{number}")
@@ -112,23 +112,23 @@ def test_parameters_are_fetched_once_and_aliases_are_asked_for_each_time(publish
     asked = []
     with answering(published, asked) as url:
         for _ in range(2):
-            fetch_primitives(url + "/", "tiny", cache_dir=tmp_path / "cache")
+            fetch_primitives(url + "/", "tiny")
     manifest = "/v1/primitives/tiny/versions/latest"
     assert asked == [manifest, blob_path(published), manifest]
 
 
 def test_a_damaged_cache_mends_itself(published, tmp_path):
     with answering(published) as url:
-        registry, version = fetch_primitives(url, "tiny", cache_dir=tmp_path / "cache")
+        registry, version = fetch_primitives(url, "tiny")
         (blob,) = (registry.root / "blobs" / "sha256").iterdir()
         blob.write_bytes(b"something else")
-        fetch_primitives(url, "tiny", cache_dir=tmp_path / "cache")
+        fetch_primitives(url, "tiny")
     assert registry.verify(str(version)) == []
 
 
 def test_two_services_have_two_caches(published, tmp_path):
     with answering(published) as first, answering(published) as second:
-        registries = [fetch_primitives(url, "tiny", cache_dir=tmp_path / "cache")[0] for url in (first, second)]
+        registries = [fetch_primitives(url, "tiny")[0] for url in (first, second)]
     assert registries[0].root != registries[1].root
 
 
@@ -138,16 +138,16 @@ def test_a_corrupted_blob_is_refused_and_nothing_is_kept(published, tmp_path, le
     status, kind, blob = published[path]
     published[path] = (status, kind, blob[:length])
     with answering(published) as url, pytest.raises(DamagedBlobError) as error:
-        fetch_primitives(url, "tiny@1", cache_dir=tmp_path / "cache")
+        fetch_primitives(url, "tiny@1")
     assert_one_line(error.value, url.removeprefix("http://"))
-    assert files_in(tmp_path / "cache") == {}
+    assert files_in(tmp_path / "xdg") == {}
 
 
 def test_a_manifest_that_was_changed_in_transit(published, tmp_path):
     path = "/v1/primitives/tiny/versions/1"
     published[path] = (200, "application/json", published[path][2].replace(b'"seed": 3', b'"seed": 4'))
     with answering(published) as url, pytest.raises(DamagedBlobError) as error:
-        fetch_primitives(url, "tiny@1", cache_dir=tmp_path / "cache")
+        fetch_primitives(url, "tiny@1")
     assert_one_line(error.value, "tiny@1", "manifest", "sha256")
 
 
@@ -157,7 +157,7 @@ def test_the_manifest_of_another_version(published, tmp_path):
     with answering(published) as url:
         for reference in ("other@1", "tiny@7"):
             with pytest.raises(DamagedBlobError) as error:
-                fetch_primitives(url, reference, cache_dir=tmp_path / "cache")
+                fetch_primitives(url, reference)
             assert_one_line(error.value, "gave the manifest of tiny@1", f"for {reference}")
 
 
@@ -171,30 +171,30 @@ def test_the_manifest_of_another_version(published, tmp_path):
 )
 def test_unknown_versions(server, tmp_path, reference, parts):
     with pytest.raises(UnknownVersionError) as error:
-        fetch_primitives(server.url, reference, cache_dir=tmp_path)
+        fetch_primitives(server.url, reference)
     assert_one_line(error.value, server.url, *parts)
 
 
 def test_the_token(home, tmp_path, monkeypatch):
     with serve(home, host="0.0.0.0") as server:
         with pytest.raises(WrongTokenError) as error:
-            fetch_primitives(server.url, "tiny", cache_dir=tmp_path)
+            fetch_primitives(server.url, "tiny")
         assert_one_line(error.value, server.url, "a token is needed", "TANDEM_TOKEN")
         monkeypatch.setenv("TANDEM_URL", server.url)
         monkeypatch.setenv("TANDEM_TOKEN", WRONG)
         with pytest.raises(WrongTokenError) as error:
-            fetch_primitives(server.url, "tiny", cache_dir=tmp_path)
+            fetch_primitives(server.url, "tiny")
         assert_one_line(error.value, "wrong token")
         assert WRONG not in str(error.value)
         monkeypatch.setenv("TANDEM_TOKEN", TOKEN)
         monkeypatch.delenv("TANDEM_URL")
         for variable in ("TANDEM_URL", "TANDEM_REGISTRY"):
             with pytest.raises(WrongTokenError) as error:  # it may be anybody's URL
-                fetch_primitives(server.url, "tiny", cache_dir=tmp_path)
+                fetch_primitives(server.url, "tiny")
             assert_one_line(error.value, "a token is needed", "TANDEM_URL to this URL")
             with monkeypatch.context() as configured:
                 configured.setenv(variable, f"{server.url}/")
-                assert fetch_primitives(server.url, "tiny", cache_dir=tmp_path)[1].number == 2
+                assert fetch_primitives(server.url, "tiny")[1].number == 2
 
 
 def test_no_service_at_the_url(home, tmp_path):
@@ -202,7 +202,7 @@ def test_no_service_at_the_url(home, tmp_path):
     server.start()
     server.stop()
     with pytest.raises(FetchError) as error:
-        fetch_primitives(server.url, "tiny", cache_dir=tmp_path)
+        fetch_primitives(server.url, "tiny")
     assert_one_line(error.value, f"cannot reach {server.url}", "refused", "tandem serve")
 
 
@@ -223,7 +223,7 @@ def test_no_service_at_the_url(home, tmp_path):
 )
 def test_something_else_at_the_url(tmp_path, answer, part):
     with answering({"/v1/primitives/tiny/versions/1": answer}) as url, pytest.raises(TandemError) as error:
-        fetch_primitives(url, "tiny@1", cache_dir=tmp_path)
+        fetch_primitives(url, "tiny@1")
     assert_one_line(error.value, part)
     assert str(error.value).isprintable()
 
@@ -231,15 +231,15 @@ def test_something_else_at_the_url(tmp_path, answer, part):
 @pytest.mark.parametrize("url", ["http://", "http://me:secret@host:1", "ftp://host", "http://host:port"])
 def test_invalid_urls(tmp_path, url):
     with pytest.raises(StatusError) as error:
-        fetch_primitives(url, "tiny", cache_dir=tmp_path)
+        fetch_primitives(url, "tiny")
     assert_one_line(error.value)
     assert "secret" not in str(error.value)
 
 
 def test_a_cache_that_cannot_be_written(server, tmp_path):
-    (tmp_path / "cache").write_text("a file")
-    with pytest.raises(StorageError, match=r"^cannot (read|write) .*cache"):
-        fetch_primitives(server.url, "tiny", cache_dir=tmp_path / "cache")
+    (tmp_path / "xdg").write_text("a file")
+    with pytest.raises(StorageError, match=r"^cannot (read|write) .*xdg"):
+        fetch_primitives(server.url, "tiny")
 
 
 @pytest.fixture(scope="module")

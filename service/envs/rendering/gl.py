@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _LIBRARIES = {"egl": ("libEGL.so.1", "libEGL.so"), "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")}
 _OFF = ("disable", "disabled", "off", "false", "0")
 _ANY = ("", "enable", "enabled", "on", "true", "1")
-_BACKENDS = {"Linux": ("egl", "osmesa", "glfw", "glx"), "Darwin": ("cgl", "glfw"), "Windows": ("glfw", "wgl")}
+_BACKENDS = {"Linux": ("egl", "osmesa", "glfw", "glx"), "Darwin": ("cgl", "glfw")}
 _INSTALL = (
     "install an OpenGL that needs no window (Debian, Ubuntu: apt-get install libegl1 libgl1, or libosmesa6 and "
     "MUJOCO_GL=osmesa); only pictures and videos need it, training works without"
@@ -82,7 +82,7 @@ def _choose() -> str:
     if requested in _OFF:
         raise TandemError(f"cannot draw: MUJOCO_GL={requested} turns rendering off; unset it")
     if requested not in _ANY:
-        return "glfw" if requested in ("glx", "wgl") else requested
+        return "glfw" if requested == "glx" else requested
     backends = _BACKENDS.get(platform.system(), ("glfw",))
     return next(backend for backend in backends if backend not in _LIBRARIES or _is_installed(backend))
 
