@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from service.actors.evaluation import Evaluation as Evaluation
     from service.base import errors as errors
     from service.config import Config as Config
+    from service.envs.gym.tabletop import EnvState as EnvState
     from service.envs.gym.tabletop import TabletopEnv as TabletopEnv
     from service.envs.gym.vector import TabletopVectorEnv as TabletopVectorEnv
     from service.envs.task import Bodies as Bodies
@@ -56,6 +57,7 @@ _PLACES = {
     "Bodies": "service.envs.task",
     "find_task": "service.envs.tasks",
     "TabletopEnv": "service.envs.gym.tabletop",
+    "EnvState": "service.envs.gym.tabletop",
     "TabletopVectorEnv": "service.envs.gym.vector",
     "ComposePrimitives": "service.methods.compose",
     "ComposePrimitivesVector": "service.methods.compose",

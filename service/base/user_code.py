@@ -101,7 +101,8 @@ def find(reference: Reference, texts: Texts, kind: Callable[[object], bool], wha
             there = (
                 f"{len(known)} of them: {', '.join(known)}; write {reference.origin}:NAME" if known else "none of it"
             )
-            raise CodeError(f"{reference.origin}: it has to define one {what}, and has {there}")
+            method = f"; a method of yours goes by --method {reference.origin}" if what == "task" and not known else ""
+            raise CodeError(f"{reference.origin}: it has to define one {what}, and has {there}{method}")
         return getattr(module, known[0])
     if reference.name not in known:
         there = f"there is {', '.join(known)}" if known else "there is none in this file"
@@ -156,9 +157,9 @@ def naming_unexpected(origin: str | None) -> Iterator[None]:
     """As ``naming_errors_of``, but for errors of which the code is not the cause; None: it is not a user's."""
     try:
         yield
-    except (TandemError, OSError, MemoryError):
+    except (TandemError, MemoryError):
         raise
-    except Exception:
+    except (Exception, SystemExit):
         if origin is None:
             raise
         with naming_errors_of(origin):

@@ -252,13 +252,16 @@ def _on_ray(stack: ExitStack, options: ClusterOptions, address: str | None, path
 
 def _print(study: StudyFile, path: Path, registry: Path | None) -> None:
     """Print a line for each run, one for all that differ in nothing but their seed, and where everything is."""
-    from service.runs.study_results import measure_of, summaries
+    from service.runs.study_results import MEASURES, measure_of, summaries
 
-    runs = study.runs.values()
+    runs, measure = study.runs.values(), measure_of(study.runs.values())
     measured = [name for name in _MEASURED if any(name in run.result for run in runs)]
+    if measure is not None and not measured:
+        measured = [measure]
+    form = ".1%" if measure in MEASURES else ".4g"  # what a method of a user's measures may be anything
     rows = [
         [name, run.state, f"{run.env_steps:,}", f"{run.wall_s / 60:.1f}"]
-        + [f"{run.result[key]:.1%}" if key in run.result else "-" for key in measured]
+        + [f"{run.result[key]:{form}}" if key in run.result else "-" for key in measured]
         for name, run in study.runs.items()
     ]
     print_table(("run", "state", "env steps", "minutes", *measured), rows)
@@ -268,13 +271,13 @@ def _print(study: StudyFile, path: Path, registry: Path | None) -> None:
             [
                 *settings.values(),
                 str(each.num),
-                f"{each.mean:.1%}",
-                f"{each.iqm:.1%}",
-                f"{each.low:.1%} to {each.high:.1%}" if each.num > 1 else "-",
+                f"{each.mean:{form}}",
+                f"{each.iqm:{form}}",
+                f"{each.low:{form}} to {each.high:{form}}" if each.num > 1 else "-",
             ]
             for settings, each in over
         ]
-        print_table((*over[0][0], f"runs of {measure_of(runs)}", "mean", "IQM", "95 % interval"), rows)
+        print_table((*over[0][0], f"runs of {measure}", "mean", "IQM", "95 % interval"), rows)
     if study.best is not None:
         typer.echo(f"best         {study.best}, chosen by goals other than those reported here")
     typer.echo(f"results      {path / 'results.csv'}")

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from service.base.errors import ConfigError, did_you_mean
 from service.base.parsing import EXPONENT
-from service.base.user_code import recorded
+from service.base.user_code import parse_reference, recorded
 from service.config.find import METHODS, find_class
 from service.config.frozen import NO_KEYS, first_error, first_of
 from service.config.run import Config
@@ -40,7 +40,7 @@ def load_config(
     for override in overrides:
         apply_override(tree, override)
     if path is not None and not tree.keys() & {"name", "task"}:  # or else it is published as one of ours
-        tree["name"] = name or re.sub(r"[^a-z0-9]+", "-", Path(path).stem.lower()).strip("-")[:64] or "run"
+        tree["name"] = name or _name_of(Path(path))
     if code:
         tree.setdefault("code", dict(code))
     if path is None:
@@ -70,6 +70,11 @@ def parse_config(tree: dict[str, Any], *, where: str) -> Config:
         raise ConfigError(f"{where}: {error}") from error
     if texts is not code:
         tree = {**tree, "code": texts}
+    if (reference := parse_reference(method)) is not None:
+        if "task" in tree and "task" not in kind.model_fields:
+            raise ConfigError(f"{where}: {method} learns no task: leave out task = {tree['task']!r}")
+        if "name" not in tree and kind.model_fields["name"].default == Config.model_fields["name"].default:
+            tree = {**tree, "name": _name_of(Path(reference.origin))}
     try:
         return kind.model_validate(tree)
     except ValidationError as error:
@@ -104,6 +109,11 @@ def dump_config(config: Config) -> str:
     """The resolved configuration as YAML that ``load_config`` reads back to an equal object."""
     text: str = yaml.dump(config.model_dump(mode="json"), Dumper=_Dumper, sort_keys=False)
     return text
+
+
+def _name_of(file: Path) -> str:
+    """The name of a file as a name of the registry."""
+    return re.sub(r"[^a-z0-9]+", "-", file.stem.lower()).strip("-")[:64] or "run"
 
 
 class _Dumper(yaml.SafeDumper):

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from service.base.errors import ConfigError, DivergedError
+from service.base.errors import ConfigError, DivergedError, TandemError
 from service.base.liveness import count_work
 from service.base.types import BoolArray, FloatArray, IntArray, StateArray
 from service.config import WorldConfig
@@ -75,8 +75,9 @@ class WorldBatch:
         log.logto_file = log.logto_console = False
         log.set()
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        num_threads = min(num_threads or cores, num_worlds)
+        num_threads = self._num_threads = min(num_threads or cores, num_worlds)
         self._pool = rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
+        self._closed = False
         self._data = [mujoco.MjData(self.model) for _ in range(max(num_threads, 1))]
         self.layout = build_layout(config, blocked_fraction=blocked_fraction)
         """Columns of ``states``."""
@@ -107,8 +108,14 @@ class WorldBatch:
     def __exit__(self, *error: object) -> None:
         self.close()
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """A copy, or what is unpickled, is made anew and gets the states: MuJoCo's pool of threads cannot be copied."""
+        made = self.config, self.num_worlds, self._num_threads, self.blocked_fraction
+        return _made_again, (*made, self.states.copy(), list(self.diverged))
+
     def close(self) -> None:
         """Stop the native threads; the batch cannot step afterwards."""
+        self._closed = True
         self._pool.close()
 
     # --- state -----------------------------------------------------------------------------------------------------
@@ -236,7 +243,10 @@ class WorldBatch:
         Raises:
             ValueError: actions of the wrong shape.
             DivergedError: actions that are not finite; no world has moved.
+            TandemError: the batch is closed.
         """
+        if self._closed:
+            raise TandemError("step of worlds that are closed: make new ones")
         index = slice(None) if worlds is None else worlds
         if worlds is not None and not worlds.size:
             return np.zeros(self.num_worlds, dtype=bool)  # MuJoCo's rollout of no states is a segmentation fault
@@ -427,3 +437,18 @@ def _fixture(geom: str) -> str:
     """The words for the fixture that a part of the model belongs to."""
     name = geom.removeprefix(FIXTURE_PREFIX).partition("-")[0]
     return f"world.fixtures[{name}]" if name.isdigit() else f"the {name}"
+
+
+def _made_again(
+    config: WorldConfig,
+    num_worlds: int,
+    num_threads: int,
+    blocked_fraction: float,
+    states: StateArray,
+    diverged: list[tuple[StateArray, FloatArray]],
+) -> WorldBatch:
+    worlds = WorldBatch(config, num_worlds, num_threads=num_threads, blocked_fraction=blocked_fraction)
+    worlds.diverged = diverged
+    worlds.states = states
+    worlds._see()
+    return worlds

@@ -115,7 +115,7 @@ class TabletopWorlds(ABC):
         worlds: dict[str, Any] = {name: np.array(array) for name, array in arrays.items()}
         self.previous = worlds.pop("previous")
         worlds.setdefault("memory", np.zeros((self.num_worlds, 0)))
-        self._see(self.env.restore(EnvState(**worlds, random=tuple(random))))
+        self._see(self.env.restore(EnvState(**worlds, random=random)))
 
     def close(self) -> None:
         """Stop the worlds' threads."""

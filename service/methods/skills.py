@@ -180,8 +180,8 @@ def check_reward(config: SkillsConfig, code: Mapping[str, str]) -> IntrinsicRewa
         with torch.no_grad():
             found = reward.network(rows).numpy()
     num = config.sac.batch_size
+    checked(f"{where}.loss", np.array(loss), ())  # first: what has learned from a wrong one pays wrongly
     checked(f"{where}.paid", paid, (num, config.size) if reward.pays_features else (num,))
-    checked(f"{where}.loss", np.array(loss), ())
     if not resumes:
         raise CodeError(f"{where}: goes on otherwise after load_state(state()): tensors() has to have all that changes")
     if not layers or not np.allclose(relu_layers(np, layers, rows.numpy()), found, atol=1e-4):

@@ -8,21 +8,21 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
 from service.base.errors import CheckpointError, ConfigError, DivergedError, TandemError
 from service.base.jsonl import plain
-from service.base.tensors import split_parts
-from service.base.types import Arrays, Metrics
+from service.base.types import Metrics
 from service.base.user_code import CodeError, check_members, naming_unexpected, origin_of
 from service.config import Config
-from service.methods.method import Iteration, Method, State
+from service.methods.method import Iteration, Method, State, Timing
 from service.policies.parameters import Parameters, PolicyError
 from service.runs.resuming import changed_settings
+from service.runs.states import check_comes_back, flatten, put_together
 from service.store.checkpoints import CheckpointStore
 from service.store.run_directory import Published, Resumption, RunDirectory
 from service.store.tail import INDEX
@@ -35,6 +35,8 @@ NUM_SNAPSHOTS = 10
 """Snapshots of what was learned, evenly over a run's env steps; one of it untrained comes before them."""
 MAX_IDLE = 1000
 """Iterations in a row without env steps: a run of them would never end."""
+_GOAL_COLUMNS = 7
+"""Of ``Iteration.goals``."""
 BEAT_S = 1.0
 """Time between two heartbeats of a run whose iterations take longer."""
 _logger = logging.getLogger(__name__)
@@ -87,7 +89,9 @@ class Run:
         """Seconds spent on iterations, by all processes that ran this run."""
         self._iteration_s = 0.0
         self._last_beat = time.monotonic()
-        self._stop_requested, self._num_idle = False, 0
+        self._stop_requested, self._closed, self._num_idle = False, False, 0
+        self._not_finite = set[str]()
+        """Metrics of which it was said that they are NaN or infinite."""
         self._ending: Ending | None = None
         self._on_iteration: OnIteration = lambda metrics: None
         self._on_beat = on_beat
@@ -100,6 +104,14 @@ class Run:
         if saved is None:
             check_members(type(method), Method, _REPLACEABLE)
         self._expect(hasattr(method, "timing"), "build", method, "one whose __init__ calls super().__init__()")
+        if hidden := [name for name in vars(method) if callable(getattr(Method, name, None))]:
+            raise CodeError(
+                f"{self._origin}: self.{hidden[0]} hides {hidden[0]}() of every Method; give it another name, such as "
+                f"self._{hidden[0]}"
+            )
+        self._expect(
+            isinstance(method.timing, Timing), "self.timing", method.timing, "it another name, such as _timing"
+        )
         self.method = method
         method.on_wait = self._beat
         try:
@@ -159,8 +171,15 @@ class Run:
         return reason
 
     def close(self) -> None:
-        """End what the method has started; a second call does nothing."""
-        self.method.close()
+        """End what the method has started; a second call does nothing. What a user's raises there is only warned of."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            with self.naming_errors():
+                self.method.close()
+        except CodeError as error:
+            _logger.warning("%s; what the run has learned is there", error)
 
     def _stop_reason(self) -> str | None:
         if self._stop_requested:
@@ -178,11 +197,11 @@ class Run:
         try:
             with self.naming_errors():
                 ended = method.step()
-            if ended is not None:
-                self._check(ended, before)
+            self._check(ended, before, played)
             if ended is not None and interval and self.iteration % interval == 0:
                 with method.timing("evaluate"), self.naming_errors():
                     evaluated = self.numbers("evaluate", method.evaluate())
+                    self._refuse("evaluate", evaluated.keys() & {*INDEX})
         except (DivergedError, PolicyError) as error:
             raise self._diverged(error, played) from error
         except CodeError as error:
@@ -210,9 +229,10 @@ class Run:
         """Say of an unexpected error of a user's method where in its file it comes from."""
         return naming_unexpected(self._origin)
 
-    def _check(self, ended: object, before: int) -> None:
-        """Check an iteration, which began at so many env steps; all of it if the method is a user's."""
-        self._num_idle = self._num_idle + 1 if self.num_env_steps <= before else 0
+    def _check(self, ended: object, before: int, played: int) -> None:
+        """Check what a step gave, before which there were so many env steps and iterations; of a user's all of it."""
+        if ended is not None:
+            self._num_idle = self._num_idle + 1 if self.num_env_steps <= before else 0
         if self._num_idle >= MAX_IDLE:
             words = f"{MAX_IDLE} iterations made no env steps"
             if self._origin is None:
@@ -220,23 +240,55 @@ class Run:
             raise CodeError(f"{self._origin}: {words}; say how many with self.count(NUMBER)")
         if self._origin is None:
             return
+        counted = self.iteration - played
+        if counted != (ended is not None):
+            given = "None" if ended is None else "an Iteration"
+            raise CodeError(
+                f"{self._origin}: step counted {counted} iterations and gave {given}: call self.count(NUMBER) once for "
+                "each Iteration that it returns"
+            )
+        self._expect(isinstance(self.method.converged, bool | np.bool_), "converged", self.method.converged, "a bool")
+        if ended is None:
+            return
         self._expect(isinstance(ended, Iteration), "step", ended, "an Iteration or None")
         assert isinstance(ended, Iteration)
         metrics = self.numbers("the Iteration of step", ended.metrics)
-        if any(metrics.get(name) is None for name in INDEX):
+        if any(
+            metrics.get(name) != number
+            for name, number in zip(INDEX, (self.iteration, self.num_env_steps), strict=True)
+        ):
             raise CodeError(
-                f"{self._origin}: the metrics of an Iteration lack iteration and env_steps: begin them with what "
-                "self.count(NUMBER) gives"
+                f"{self._origin}: the metrics of an Iteration lack its iteration and env_steps: begin them with what "
+                "self.count(NUMBER) gives, and leave these two as they are"
+            )
+        goals = ended.goals
+        if goals is not None and (
+            not isinstance(goals, np.ndarray) or goals.ndim != 2 or goals.shape[1] != _GOAL_COLUMNS
+        ):
+            raise CodeError(
+                f"{self._origin}: the goals of an Iteration are {getattr(goals, 'shape', goals)!r}; give an array of "
+                f"shape (M, {_GOAL_COLUMNS}), or None"
+            )
+
+    def _refuse(self, verb: str, names: Collection[str]) -> None:
+        """Refuse metrics of a user's method that the run has itself."""
+        if self._origin is not None and names:
+            raise CodeError(
+                f"{self._origin}: {verb} gave {', '.join(sorted(names))}, which the run says; leave them out"
             )
 
     def numbers(self, verb: str, found: Metrics) -> Metrics:
         """Metrics that a verb of the method gave; those of a user's are checked."""
         self._expect(isinstance(found, Mapping), verb, found, "metrics, numbers by name")
         for name, value in found.items() if self._origin is not None else ():
-            if not (isinstance(name, str) and isinstance(plain(value), int | float | None)):
+            number = plain(value)
+            if not (isinstance(name, str) and isinstance(number, int | float | None)):
                 raise CodeError(
-                    f"{self._origin}: {verb} gave {name!r}: {value!r}, which is no number; give numbers by name"
+                    f"{self._origin}: {verb} gave {{{name!r}: {value!r}}}; give numbers by names, which are text"
                 )
+            if number is None and name not in self._not_finite:
+                self._not_finite.add(name)
+                _logger.warning("%s: %s gave %s = %s, which is recorded as missing", self._origin, verb, name, value)
         return found
 
     def parameters(self) -> Parameters:
@@ -286,7 +338,7 @@ class Run:
             said = ", ".join(f"{key} from {was!r} to {now!r}" for key, (was, now) in changed.items())
             _logger.info("changed since iteration %d: %s", checkpoint.step, said)
         self.wall_s = float(meta["wall_s"])
-        return resumption, {**split_parts(checkpoint.arrays), **meta["state"]}
+        return resumption, put_together(checkpoint.arrays, meta["state"])
 
     def _save(self) -> None:
         """Write a checkpoint: with it alone a new process goes on.
@@ -328,7 +380,7 @@ class Run:
                 raise
             raise CodeError(
                 f"{self._origin}: {verb} gave what cannot be saved: {error}; give arrays of numbers, and of a state "
-                "also plain values, as JSON has them"
+                "also plain values, as JSON has them, and lists and dictionaries of both"
             ) from error
 
     def _take_snapshot(self, *, before: int) -> None:
@@ -370,40 +422,3 @@ class Run:
             raise UnsavedError(
                 f"{error}; the run is at iteration {self.iteration}, saved is iteration {saved}: --resume goes on there"
             ) from error
-
-
-def check_comes_back(state: State) -> None:
-    """Refuse what a checkpoint would give back as something else.
-
-    Raises:
-        ValueError: a component with a slash in its name, keys that are no text, or a tuple.
-    """
-    for name, part in state.items():
-        if "/" in name:
-            raise ValueError(f"{name!r} has a slash")
-        _check_plain(name, part)
-
-
-def _check_plain(name: str, part: object) -> None:
-    if isinstance(part, tuple):
-        raise ValueError(f"{name!r} has a tuple, which comes back as a list")
-    if isinstance(part, Mapping):
-        if not all(isinstance(key, str) for key in part):
-            raise ValueError(f"{name!r} has keys that are no text")
-        for each in part.values():
-            _check_plain(name, each)
-    elif isinstance(part, list):
-        for each in part:
-            _check_plain(name, each)
-
-
-def flatten(state: State) -> tuple[Arrays, dict[str, Any]]:
-    """The arrays of a state as ``COMPONENT/NAME``, and its plain values by name."""
-    arrays: Arrays = {}
-    values: dict[str, Any] = {}
-    for name, part in state.items():
-        if isinstance(part, Mapping) and part and all(isinstance(each, np.ndarray) for each in part.values()):
-            arrays |= {f"{name}/{key}": array for key, array in part.items()}
-        else:
-            values[name] = part
-    return arrays, values

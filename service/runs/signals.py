@@ -58,6 +58,7 @@ class StopSignals:
             raise TandemError(
                 "training needs the main thread, as no other gets signals: call it there, or in a process of its own"
             )
+        self._pid = os.getpid()
         for number in self._previous:
             signal.signal(number, self._handle)
         return self
@@ -82,6 +83,10 @@ class StopSignals:
             self._ask = None
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        if os.getpid() != self._pid:  # a process that a user's method forked, to which none of this applies
+            signal.signal(number, self._previous[signal.Signals(number)])
+            os.kill(os.getpid(), number)
+            return
         if number in _MAY_COME_TWICE and self.first is not None:
             return
         self.first = self.first or number

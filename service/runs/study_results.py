@@ -81,9 +81,9 @@ def summarise(groups: Sequence[Sequence[float]]) -> Summary:
 
 
 def measure_of(runs: Iterable[StudyRun]) -> str | None:
-    """The result that a table is of; None where no run has one."""
-    there = {name for run in runs for name in run.result}
-    return next((name for name in MEASURES if name in there), None)
+    """The result that a table is of, of a method of a user's the first that it has; None where no run has one."""
+    there = list(dict.fromkeys(name for run in runs for name in run.result))
+    return next((name for name in (*MEASURES, *there) if name in there), None)
 
 
 def summaries(runs: Iterable[StudyRun]) -> list[tuple[Settings, Summary]]:

@@ -263,7 +263,8 @@ def _run(
 
 def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, report: Report) -> Finished:
     publishing = "publishing, " * (publish and run.config.publishable)
-    _logger.info("learning is over; now evaluating, %sdrawing and recording a video", publishing)
+    drawing = f", {publishing}drawing and recording a video" if run.config.makes is not None else ""
+    _logger.info("learning is over; now evaluating%s", drawing)
     config, directory = run.config, run.directory
     with run.naming_errors():
         parameters, measured = run.parameters(), dict(run.numbers("measure", run.method.measure()))
@@ -272,10 +273,14 @@ def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, repor
     if missing := measured.keys() - metrics.keys():
         _logger.warning("measured, and no finite number: %s", ", ".join(sorted(missing)))
     version = None
-    run.close()
     directory.check_owner()
-    found: dict[str, JsonValue] = {name.removeprefix("evaluation/"): value for name, value in metrics.items()}
+    short = {name: name.removeprefix("evaluation/") for name in metrics}
+    found: dict[str, JsonValue] = {
+        name if short[name] != name and short[name] in metrics else short[name]: value
+        for name, value in metrics.items()
+    }
     directory.write_result({"evaluation": found, "env_steps": run.num_env_steps, "wall_s": run.wall_s})
+    run.close()
     report.measured(metrics)
     try:
         if publish and config.publishable:

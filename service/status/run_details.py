@@ -13,6 +13,7 @@ import numpy as np
 from service.base.errors import ConfigError, StorageError
 from service.base.files import last_lines, open_regular, read_regular
 from service.base.parsing import ParseError, parse_json
+from service.base.user_code import parse_reference
 from service.config.run import CELL_SIZE_M
 from service.config.tree import read_yaml
 from service.generator.records import of_furthest
@@ -72,6 +73,8 @@ def _study_options(path: Path) -> list[str]:
 
 def _uses(run: RunStatus, path: Path, place: list[str], config: dict[str, Any]) -> tuple[RunCommand, ...]:
     """The commands that use what a run has learned, but for those that its method refuses."""
+    if parse_reference(str(config.get("method"))) is not None:  # a method of a user's makes nothing of a known kind
+        return ()
     refused = set()
     skills = config.get("skills")
     if isinstance(skills, dict) and skills.get("zero_shot") == "none":  # no skill leads to a goal

@@ -140,11 +140,33 @@ def test_a_key_of_one_method_is_unknown_to_another(file, method, key, said):
         ("count(10)", "count(0.5)", "mine.py:15: TypeError: 'float' object cannot be interpreted as an integer"),
         ("return Climb(self)", "return 3", "mine.py: build gave a int; give a Method"),
         ("super().__init__()", "pass", "mine.py: build gave a Climb; give one whose __init__ calls super().__init__()"),
-        ("self.count(10) | {", "{", "the metrics of an Iteration lack iteration and env_steps"),
+        ("self.count(10) | {", "{", "step counted 0 iterations and gave an Iteration: call self.count(NUMBER) once"),
+        ("return Iteration(", "Iteration(", "step counted 1 iterations and gave None: call self.count(NUMBER) once"),
+        ("self.count(10) | {", "self.count(0) | self.count(10) | {", "step counted 2 iterations and gave an Iteration"),
+        ('"climb/height": self.height', '"env_steps": 7', "lack its iteration and env_steps: begin them with what"),
+        ('"climb/height": self.height', '"iteration": float("nan")', "lack its iteration and env_steps"),
+        (
+            "self.height})",
+            "self.height}, np.zeros((5, 3)))",
+            "the goals of an Iteration are (5, 3); give an array of shape",
+        ),
+        (
+            "self.height += ",
+            "self.converged = np.zeros(2); self.height += ",
+            "mine.py: converged gave a ndarray; give a",
+        ),
+        ("self.height += ", "open('gone'); self.height += ", "mine.py:14: FileNotFoundError: "),
+        ("self.height += ", "raise SystemExit(0); self.height += ", "mine.py:14: SystemExit: 0"),
+        ("0.0\n", "0.0; self.grid = np.zeros(3)\n", "mine.py: self.grid hides grid() of every Method; give it another"),
+        (
+            "0.0\n",
+            "0.0; self.timing = 0.0\n",
+            "mine.py: self.timing gave a float; give it another name, such as _timing",
+        ),
         (
             '"climb/height": self.height',
             '"climb/height": "high"',
-            "mine.py: the Iteration of step gave 'climb/height': 'high'",
+            "mine.py: the Iteration of step gave {'climb/height': 'high'}; give numbers by names",
         ),
         (
             'return {"height": np.array([self.height])}',
@@ -154,7 +176,7 @@ def test_a_key_of_one_method_is_unknown_to_another(file, method, key, said):
         (
             '"rng": self.rng.bit_generator.state',
             '"rng": object()',
-            "mine.py: state gave what cannot be saved: Object of type object is not",
+            "mine.py: state gave what cannot be saved: 'rng' has a object; give arrays of numbers, and of a state",
         ),
         ('"rng": self', '"n/rng": self', "mine.py: state gave what cannot be saved: 'n/rng' has a slash"),
         (
@@ -178,6 +200,103 @@ def test_an_error_of_the_method_names_its_line(file, tmp_path, monkeypatch, old,
     with pytest.raises(ConfigError) as error:
         train(config_of(), RunDirectory(tmp_path / "run"), tmp_path / "registry", on_iteration=ignore)
     assert_one_line(error.value, said)
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_what_the_run_says_is_not_evaluated(file, tmp_path):
+    file.write_text(
+        CODE.replace("def parameters", 'def evaluate(self):\n        return {"env_steps": 3}\n\n    def parameters')
+    )
+    config = config_of("run.evaluation_interval=1")
+    with pytest.raises(ConfigError) as error:
+        train(config, RunDirectory(tmp_path / "run"), tmp_path / "registry", on_iteration=ignore)
+    assert_one_line(error.value, "mine.py: evaluate gave env_steps, which the run says; leave them out")
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_its_result_is_there_whatever_its_end_raises(file, tmp_path, caplog):
+    text = CODE.replace('{"evaluation/height": self.height}', '{"evaluation/height": 2.0, "height": 1.0}')
+    file.write_text(
+        text.replace("def close(self):\n        pass", 'def close(self):\n        raise ValueError("bad end")')
+    )
+    directory = RunDirectory(tmp_path / "run")
+    train(config_of(), directory, tmp_path / "registry", on_iteration=ignore)
+    assert directory.read_result()["evaluation"] == {"height": 1.0, "evaluation/height": 2.0}
+    assert read_status(tmp_path / "run").state == "finished"
+    assert [each.message for each in caplog.records if "bad end" in each.message] == [
+        "mine.py:30: ValueError: bad end; what the run has learned is there"
+    ]
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_a_metric_that_is_not_finite_is_told_once(file, tmp_path, caplog):
+    file.write_text(CODE.replace('"climb/height": self.height', '"climb/height": float("inf")'))
+    train(config_of(), RunDirectory(tmp_path / "run"), tmp_path / "registry", on_iteration=ignore)
+    said = "mine.py: the Iteration of step gave climb/height = inf, which is recorded as missing"
+    assert [each.message for each in caplog.records].count(said) == 1
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_a_state_may_be_nested(file, tmp_path, capsys):
+    """Arrays and NumPy's numbers beside plain values, in dictionaries and lists, come back as they were."""
+    state = """{
+            "policy": self.parameters(), "rng": self.rng.bit_generator.state, "top": np.arange(3),
+            "one": np.float32(0.1), "deep": {"m": [np.ones(2), {"t": np.int64(4)}], "n": None}, "n": 3}"""
+    text = CODE.replace('{"policy": self.parameters(), "rng": self.rng.bit_generator.state}', state).replace(
+        "        self.height, self.rng.bit_generator.state = ",
+        """
+        assert state["top"].tolist() == [0, 1, 2]
+        assert state["one"] == np.float32(0.1) and type(state["one"]) is np.float32
+        ones, rest = state["deep"]["m"]
+        assert ones.tolist() == [1, 1] and type(rest["t"]) is np.int64 and rest["t"] == 4
+        assert state["deep"]["n"] is None and state["n"] == 3
+        print("all is back")
+        self.height, self.rng.bit_generator.state = """,
+    )
+    file.write_text(text)
+    directory = RunDirectory(tmp_path / "run")
+    train(config_of(), directory, tmp_path / "registry", on_iteration=ignore)
+    config = resumed_config(directory, ["run.total_env_steps=80"])
+    assert train(config, directory, tmp_path / "registry", resume=True, on_iteration=ignore).num_env_steps == 80
+    assert "all is back" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_an_environment_goes_on_where_it_was(file, tmp_path):
+    """As ``docs/own_method.md`` says: a resumed run has the rewards of one that was not cut."""
+    text = CODE.replace(
+        "import numpy", "from dataclasses import asdict\nfrom tandem_skills import EnvState, make_env\nimport numpy"
+    )
+    text = text.replace(
+        "0.0\n", "0.0\n        self.env = make_env('push', num_envs=2)\n        self.env.reset(seed=3)\n", 1
+    )
+    text = text.replace(
+        "self.rng.random()", "float(self.env.step(self.env.action_space.sample() * 0 + 0.3)[0]['observation'].sum())"
+    )
+    text = text.replace('{"policy"', '{"env": asdict(self.env.state()), "policy"')
+    text = text.replace(
+        "        self.height, self.rng",
+        "        self.env.restore(EnvState(**state['env']))\n        self.height, self.rng",
+    )
+    file.write_text(text.replace("def close(self):\n        pass", "def close(self):\n        self.env.close()"))
+    for name, budgets in (("whole", (60,)), ("cut", (20, 60))):
+        directory = RunDirectory(tmp_path / name)
+        for budget in budgets:
+            again = directory.exists
+            settings = [f"run.total_env_steps={budget}"]
+            config = resumed_config(directory, settings) if again else config_of(*settings)
+            train(config, directory, tmp_path / "registry", resume=again, on_iteration=ignore)
+    rows = [[row["climb/height"] for row in read_lines(tmp_path / name / "metrics.jsonl")] for name in ("whole", "cut")]
+    assert rows[0] == rows[1]
+    assert len(set(rows[0])) == 6
+
+
+def test_a_run_without_a_name_has_that_of_the_file(file):
+    assert load_config(None, ["method=mine.py:Mine"]).name == "mine"
+    assert load_config(None, ["method=mine.py:Mine", "name=hill"]).name == "hill"
+    with pytest.raises(ConfigError) as error:
+        load_config(None, ["method=mine.py:Mine", "task=push"])
+    assert_one_line(error.value, "mine.py:Mine learns no task: leave out task = 'push'")
 
 
 @pytest.mark.usefixtures("default_signals")

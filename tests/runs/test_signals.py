@@ -97,6 +97,17 @@ def test_after_the_question_a_signal_raises_again():
             send(signal.SIGINT)
 
 
+def test_a_forked_process_ends_by_a_signal_as_it_did_before():
+    """As those of ``multiprocessing.Pool`` in a method of a user's, which are ended by SIGTERM."""
+    with StopSignals() as signals, signals.asking(lambda: None):
+        child = os.fork()
+        if not child:
+            os.kill(os.getpid(), signal.SIGTERM)
+            os._exit(0)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGTERM
+        assert signals.first is None
+
+
 def test_another_thread_gets_no_signals_and_is_told_so():
     with ThreadPoolExecutor(1) as threads, pytest.raises(TandemError) as error:
         threads.submit(StopSignals().__enter__).result()

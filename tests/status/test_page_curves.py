@@ -27,6 +27,9 @@ def home(tmp_path_factory):
     write_status(runs, "long", state="finished")
     values = {"bob/success_rate": 0.5}
     append(runs, "long", *(record(i, **values, **{"learner/kl": 9.0 if i == 1234 else 0.01}) for i in range(1, LONG)))
+    write_status(runs, "hill", state="finished")
+    values = {"climb/height": 3.0, "time/env_steps_per_s": 50.0}
+    append(runs, "hill", *({"iteration": i, "env_steps": 1000 * i, **values} for i in range(1, 4)))
     (runs / "night").mkdir()
     (runs / "night" / "study.json").write_text("name: night\n")
     for seed in (0, 1):
@@ -126,12 +129,26 @@ def test_a_long_run_is_thinned_smoothed_and_asked_for_anew(visit):
     assert [said for said in visit.complaints if "404" not in said] == []  # this run has no goals
 
 
+def test_a_run_of_another_method_shows_what_it_has(visit):
+    """No empty panels of self-play: what it records is open."""
+    page = visit.go("#/runs/hill").page
+    assert visit.points("climb/height", 3, "hill") == [(1000, 3.0), (2000, 3.0), (3000, 3.0)]
+    assert visit.chart("height").is_visible()
+    assert visit.chart("Throughput").is_visible()
+    visit.wait("document.querySelectorAll('.chart:not([hidden])').length === 3")  # time's, which is closed, has one
+    for name in ("Bob on random goals", "Policy lag", "Alice's proposals"):
+        assert visit.chart(name).is_hidden()
+    for name in ("Goal map", "Goals over the run"):
+        assert page.get_by_role("heading", name=name).count() == 0 or page.get_by_role("heading", name=name).is_hidden()
+    assert page.get_by_text("Bob's success").is_hidden()
+
+
 def test_runs_are_found_sorted_and_compared(visit):
     page = visit.go("#/").page
     listed = page.locator("tbody tr a")
     page.get_by_role("link", name="night-seed-1").wait_for()
     page.get_by_label("Sort by").select_option("success")
-    assert listed.all_inner_texts() == ["night-seed-1", "long", "cube", "old", "night-seed-0"]
+    assert listed.all_inner_texts() == ["night-seed-1", "long", "cube", "old", "night-seed-0", "hill"]
     page.get_by_label("Show").select_option("ended")
     page.get_by_label("Find a run").fill("night")
     assert listed.all_inner_texts() == ["night-seed-1", "night-seed-0"]

@@ -88,6 +88,8 @@ def test_a_configuration_that_cannot_be_read(tmp_path):
         ("skills: 3\n", set()),  # written by hand
         ("task: wall\nprimitives_digest:\n", {"publish"}),
         ("task: wall\nprimitives_digest: abc\n", set()),
+        ("method: self-play\n", set()),
+        ("method: mine.py:Climb\n", {"evaluate", "play", "render", "publish"}),  # makes nothing of a known kind
     ],
 )
 def test_what_a_method_refuses_is_no_command(directory, tmp_path, text, refused):

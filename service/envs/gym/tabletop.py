@@ -43,7 +43,7 @@ class EnvState:
     """(N,) steps of the episode."""
     memory: StateArray
     """(N, M) of the task; (N, 0) where it keeps none."""
-    random: tuple[dict[str, Any], ...]
+    random: list[dict[str, Any]]
     """State of each world's bit generator, which draws object and goal at the next reset."""
 
 
@@ -115,7 +115,7 @@ class GoalWorlds:
 
     def state(self) -> EnvState:
         """Copy everything that ``restore`` needs."""
-        random = tuple(deepcopy(dict(each.bit_generator.state)) for each in self._random)
+        random = [deepcopy(dict(each.bit_generator.state)) for each in self._random]
         kept = self._goal.copy(), self.rules.elapsed.copy(), self.rules.memory.copy()
         return EnvState(self._worlds.states.copy(), *kept, random)
 
@@ -338,6 +338,10 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
 
             self._renderer = SceneRenderer(self.config, *self._image_size)
         return self._renderer.render(self._worlds.states[0], self._goal[0])
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Of a copy; it opens a renderer of its own when it draws."""
+        return self.__dict__ | {"_renderer": None}
 
     def close(self) -> None:
         """Free the renderer and the physics; the environment cannot step afterwards."""

@@ -10,6 +10,8 @@ import { SPANS, usualPlace } from "./smoothing.js";
 
 const MAX_POINTS = 1000;
 const MAX_NAMES = 60;
+/** Most metrics of a run without panels of its own whose groups are open from the start. */
+const MANY = 24;
 /** Most runs that the service takes in one question. */
 const MAX_RUNS = 200;
 /** Characters that the runs of a question may take, and its metrics as many: nginx takes 8 KiB of URL. */
@@ -23,6 +25,8 @@ export class Board {
   constructor(runs, panels, signal) {
     Object.assign(this, { runs, signal, data: new Map(), names: [], cursor: null, range: null });
     Object.assign(this, { axis: "env_steps", place: null, log: false, banded: false, pending: false, asked: 0 });
+    /** Whether the runs are of another kind than the panels, such as of a method of a user's. */
+    this.isOther = false;
     this.number = ++boards;
     this.panels = panels.map((spec) => new Panel(spec, this));
     this.groups = el("div", { class: "groups" });
@@ -81,7 +85,7 @@ export class Board {
   /** Panels that are to be seen. */
   shown() {
     const open = [...this.opened.values()].filter(({ details }) => details.open);
-    return [...this.panels, ...open.flatMap(({ panels }) => panels)];
+    return [...this.panels.filter((panel) => !panel.root.hidden), ...open.flatMap(({ panels }) => panels)];
   }
 
   /** Ask for the curves of all panels that are to be seen, and draw them. */
@@ -126,6 +130,9 @@ export class Board {
     const names = [...new Set(found.flatMap((run) => run.names))].sort();
     if (names.join() !== this.names.join()) {
       this.names = names;
+      const has = (panel) => panel.names.some((name) => names.includes(name));
+      this.isOther = names.length > 0 && !this.panels.some((panel) => has(panel) && !panel.names[0].startsWith("time/"));
+      for (const panel of this.panels) panel.root.hidden = this.isOther && !has(panel);
       this.list();
     }
     if (!this.range) this.usual = usualPlace(Math.max(0, ...found.map((run) => run.num_iterations)));
@@ -140,7 +147,7 @@ export class Board {
     const parts = [...groups].map(([group, names]) => this.part(group, names, Boolean(wanted)));
     for (const group of this.opened.keys()) if (!groups.has(group)) this.drop(group);
     this.groups.replaceChildren(...parts, ...(wanted && !parts.length ? [note("No metric has this in its name.")] : []));
-    if (wanted) this.refresh().catch((error) => this.fail(error));
+    if (wanted || this.isOther) this.refresh().catch((error) => this.fail(error));
   }
 
   part(group, names, open) {
@@ -151,7 +158,8 @@ export class Board {
     }
     this.drop(group);
     const body = el("div", { class: "charts" });
-    const details = el("details", { open: open || known?.details.open }, el("summary", {}, group, " ", el("small", {}, counted(names.length, "metric"))), body);
+    const few = this.isOther && this.names.length <= MANY && group !== "time"; // there is nothing else to see
+    const details = el("details", { open: open || (known ? known.details.open : few) }, el("summary", {}, group, " ", el("small", {}, counted(names.length, "metric"))), body);
     const panels = panelsOf(names).map((spec) => new Panel(spec, this));
     body.append(...panels.map((panel) => panel.root));
     details.addEventListener("toggle", () => {

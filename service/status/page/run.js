@@ -54,6 +54,7 @@ class RunPage {
     };
     for (const name of run.trial ? ["space", "map", "actors"] : []) delete parts[name]; // which self-play has
     const [name, published] = run.trial ? (run.trial.primitives ?? "").split("@") : [run.name, NAME.test(run.name)];
+    this.ofSelfPlay = [parts.space?.root, parts.map?.root, this.summary.bob.root, this.summary.tiles.lag.root].filter(Boolean);
     this.primitives = published ? new Versions(name, `Primitives ${name}`) : null;
     parts.curves.body.append(this.board.root);
     this.actorsBody = parts.actors?.body;
@@ -102,6 +103,7 @@ class RunPage {
       do {
         this.again = false;
         await this.board.refresh();
+        for (const each of this.ofSelfPlay) each.hidden = this.board.isOther;
         this.missed = false;
         this.summary.trouble(null);
         this.summary.success((await this.board.newest([BOB])).get(this.runId));

@@ -1,5 +1,7 @@
 """The Gymnasium goal environment: the convention, both checkers, exact seeds and states."""
 
+import copy
+import pickle
 import sys
 from types import SimpleNamespace
 
@@ -152,6 +154,25 @@ def test_a_restored_state_continues_bit_identically(task):
         np.testing.assert_array_equal(play(other, random_actions(15, seed=1)), expected)
         assert_same(other.reset()[0], following)
         other.close()
+
+
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"]
+)
+def test_a_copy_goes_on_by_itself_with_the_same_bits(env, copied):
+    """As where a planner tries actions in copies."""
+    env.reset(seed=3)
+    play(env, random_actions(5))
+    env._renderer = object()
+    other, actions = copied(env), random_actions(60, seed=1)
+    there = play(other, actions)
+    env._renderer = None
+    assert np.array_equal(there, play(env, actions))
+    assert_same(env.reset()[0], other.reset()[0])
+    other.close()
+    assert np.isfinite(play(env, actions[:1])).all()
+    with pytest.raises(TandemError, match="step of worlds that are closed: make new ones"):
+        other.step(actions[0])
 
 
 def test_it_is_drawn_when_asked_by_a_renderer_that_is_closed(monkeypatch, env):
