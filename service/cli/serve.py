@@ -57,7 +57,8 @@ def serve(
     typer.echo(f"runs of {runs}, primitives of {registry}: {server.url}")
     if token is None:
         typer.echo(f"read-only, for this machine: with {VARIABLE} set, runs can be stopped and aliases moved")
-    server.run()
+    with StopSignals() as signals, signals.asking(lambda: None):
+        server.run(lambda: signals.first is not None)
 
 
 def play(

@@ -7,6 +7,7 @@ import logging
 import socket
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import uvicorn
@@ -14,7 +15,6 @@ import uvicorn
 from service.base.errors import StatusError
 from service.base.ports import DEFAULT_PORT, listen, url_of
 from service.registry.registry import Registry
-from service.runs.signals import StopSignals
 from service.status.app import create_app
 from service.status.auth import is_loopback
 from service.store.models import RunReader
@@ -99,21 +99,20 @@ class StatusServer:
             self._thread.join(STOP_TIMEOUT_S)
         self._socket.close()
 
-    def run(self) -> None:
-        """Serve in the foreground until a signal that ends a run, too; only in the main thread.
+    def run(self, is_over: Callable[[], bool]) -> None:
+        """Serve in the foreground until it is over.
 
         Raises:
             StatusError: it does not start, or ends by itself.
         """
-        with StopSignals() as signals, signals.asking(lambda: None):
-            try:
-                self.start()
-                while signals.first is None:
-                    self._thread.join(_POLL_S)
-                    if not self._thread.is_alive():
-                        raise StatusError(f"the status service at port {self.port} ended by itself; the log says why")
-            finally:
-                self.stop()
+        try:
+            self.start()
+            while not is_over():
+                self._thread.join(_POLL_S)
+                if not self._thread.is_alive():
+                    raise StatusError(f"the status service at port {self.port} ended by itself; the log says why")
+        finally:
+            self.stop()
 
     def __enter__(self) -> StatusServer:
         self.start()

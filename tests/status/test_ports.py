@@ -49,7 +49,7 @@ def test_a_url_leads_to_what_listens_at_all_addresses():
 def test_serve_takes_the_next_one_unless_told_which(tmp_path, monkeypatch, busy, caplog):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs").mkdir()
-    monkeypatch.setattr("service.status.server.StatusServer.run", lambda server: server.stop())
+    monkeypatch.setattr("service.status.server.StatusServer.run", lambda server, is_over: server.stop())
     with caplog.at_level("INFO"):
         result = tandem("serve")
     assert result.exit_code == 0, result.output

@@ -107,25 +107,8 @@ def command(*arguments, **environment):
     )
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_the_foreground_ends_with_a_signal(home, number):
-    before = signal.getsignal(number)
-    server = serve(home)
-    answers = []
-
-    def use_and_end():
-        answers.append(httpx.get(f"{server.url}/livez", **CLIENT).status_code)  # once it serves
-        os.kill(os.getpid(), number)
-
-    other = threading.Thread(target=use_and_end)
-    other.start()
-    server.run()
-    other.join()
-    assert answers == [200]
-    assert signal.getsignal(number) is before
-
-
-def test_the_command(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP], ids=lambda number: number.name)
+def test_the_command(tmp_path, number):
     write_runs(tmp_path / "runs")
     publish(Registry(tmp_path / "registry"))
     (tmp_path / "token").write_text(TOKEN)
@@ -140,7 +123,7 @@ def test_the_command(tmp_path):
             assert client.get("/v1/runs/old/video").status_code == 200
             assert client.post("/v1/runs/cube/stop").status_code == 401
             assert client.post("/v1/runs/cube/stop", headers=BEARER).status_code == 202
-        process.send_signal(signal.SIGTERM)
+        process.send_signal(number)
         rest, _ = process.communicate(timeout=600)
     finally:
         process.kill()
