@@ -201,7 +201,7 @@ class Report:
         curves = self.show("Skill discovery over env steps", "skills-curves", figures.draw_skill_curves, learned)
         again = self.show("The same, made anew", "skills-curves-today", figures.draw_skill_curves, todays)
         return {
-            "today": [skills.coverage_table(todays), again],
+            "today": [skills.coverage_table(todays), skills.episodes_table(todays), again],
             "coverage": [skills.coverage_table(runs), stages],
             "curves": [curves],
         }

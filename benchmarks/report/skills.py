@@ -46,3 +46,33 @@ def each(shares: Sequence[float]) -> str:
         return ""
     mean = percent(float(np.mean(shares)), 1)
     return mean if len(shares) == 1 else f"{mean} ({', '.join(f'{100 * share:.1f}' for share in shares)})"
+
+
+_EPISODES = {
+    "moved_fraction": "moved",
+    "raised_fraction": "in the air",
+    "lifted_fraction": "in the air at its end",
+    "outside_fraction": "outside",
+}
+"""Columns by the ends of the metrics' names."""
+
+
+def episodes_table(runs: Sequence[Run]) -> str:
+    """What episodes of random skills do to the object: a row for each seed, the mean over the last tenth of its run.
+
+    The last column is the largest share of episodes that ended outside in a hundredth of the run, from its second
+    quarter on: where a run swings.
+    """
+    rows: list[Row] = []
+    for method, seeds in by_method(runs).items():
+        for run in seeds:
+            series, late = run["series"], len(run["series"]["env_steps"])
+            shares = [
+                percent(float(np.mean(series[f"skills/{name}"][-(late // 10) :])))
+                if f"skills/{name}" in series
+                else "-"
+                for name in _EPISODES
+            ]
+            most = percent(float(np.max(series["skills/outside_fraction"][late // 4 :])))
+            rows.append((METHODS[method], str(run["config"]["seed"]), *shares, most))
+    return table(("", "seed", *_EPISODES.values(), "most outside"), rows)

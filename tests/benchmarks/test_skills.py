@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import measuring, record_run, run_files
+from benchmarks.report.skills import episodes_table
 from service.actors.coverage import skill_paths, visited_share
 from service.base.errors import TandemError
 from service.config import parse_config
@@ -61,3 +62,12 @@ def test_a_monolithic_bob_is_refused(tmp_path):
     play_rounds(tmp_path, parse_config(TREE | {"policy": TREE.get("policy", {}) | policy}, where="a test"))
     with pytest.raises(TandemError, match="monolithic Bob, who has no skills"):
         record_run.record_skills(RunDirectory(tmp_path), "none")
+
+
+def test_what_episodes_do_is_told_for_each_seed():
+    """Hand-computed: of 20 points the last two count, and of the swings those from the sixth on."""
+    outside = [1.0, *[0.1] * 7, 0.6, *[0.1] * 9, 0.2, 0.4]
+    series = {"env_steps": list(range(20)), "skills/outside_fraction": outside}
+    series |= {"skills/moved_fraction": [0.0] * 18 + [0.5, 1.0], "skills/lifted_fraction": [1.0] * 18 + [0.0, 0.0]}
+    text = episodes_table([{"method": "lsd", "config": {"seed": 3}, "series": series}])
+    assert text.splitlines()[-1] == "| LSD | 3 | 75 % | - | 0 % | 30 % | 60 % |"  # raised: not recorded then
