@@ -159,8 +159,9 @@ def naming_unexpected(origin: str | None) -> Iterator[None]:
         yield
     except (TandemError, MemoryError):
         raise
-    except (Exception, SystemExit):
-        if origin is None:
+    except (Exception, SystemExit) as error:
+        its_own = any(frame.filename == origin for frame in traceback.extract_tb(error.__traceback__))
+        if origin is None or (isinstance(error, OSError | SystemExit) and not its_own):
             raise
         with naming_errors_of(origin):
             raise

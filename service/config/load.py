@@ -74,7 +74,9 @@ def parse_config(tree: dict[str, Any], *, where: str) -> Config:
         if "task" in tree and "task" not in kind.model_fields:
             raise ConfigError(f"{where}: {method} learns no task: leave out task = {tree['task']!r}")
         if "name" not in tree and kind.model_fields["name"].default == Config.model_fields["name"].default:
-            tree = {**tree, "name": _name_of(Path(reference.origin))}
+            is_file = reference.origin.endswith(".py")
+            file = Path(reference.origin if is_file else reference.origin.rpartition(".")[2])
+            tree = {**tree, "name": _name_of(file)}
     try:
         return kind.model_validate(tree)
     except ValidationError as error:

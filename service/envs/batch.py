@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import Self
+from typing import Any, Self
 
 import mujoco
 import numpy as np
@@ -110,8 +110,10 @@ class WorldBatch:
 
     def __reduce__(self) -> tuple[object, ...]:
         """A copy, or what is unpickled, is made anew and gets the states: MuJoCo's pool of threads cannot be copied."""
-        made = self.config, self.num_worlds, self._num_threads, self.blocked_fraction
-        return _made_again, (*made, self.states.copy(), list(self.diverged))
+        blocked = self.layout["gripper_blocked"]
+        made = self.config, self.num_worlds, self._num_threads, blocked.stop > blocked.start
+        kept = {"blocked_fraction": self.blocked_fraction, "diverged": list(self.diverged)}
+        return _made_again, (*made, self.states.copy(), kept, self._closed)
 
     def close(self) -> None:
         """Stop the native threads; the batch cannot step afterwards."""
@@ -443,12 +445,15 @@ def _made_again(
     config: WorldConfig,
     num_worlds: int,
     num_threads: int,
-    blocked_fraction: float,
+    has_blocked: bool,
     states: StateArray,
-    diverged: list[tuple[StateArray, FloatArray]],
+    kept: dict[str, Any],
+    closed: bool,
 ) -> WorldBatch:
-    worlds = WorldBatch(config, num_worlds, num_threads=num_threads, blocked_fraction=blocked_fraction)
-    worlds.diverged = diverged
+    worlds = WorldBatch(config, num_worlds, num_threads=num_threads, blocked_fraction=float(has_blocked))
+    vars(worlds).update(kept)
     worlds.states = states
     worlds._see()
+    if closed:
+        worlds.close()
     return worlds

@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 from service.base.errors import RunTakenError
+from service.base.jsonl import plain
 from service.base.liveness import work_done
 from service.config import Config
 from service.config.task import TaskConfig
@@ -155,11 +156,13 @@ class Report:
             self._gridded_s = time.monotonic()
             if (grid := run.method.grid()) is not None:
                 self._writer.goals(grid)
+        # those of a method of a user's may be NaN
+        version, lag = (plain(metrics.get(name)) for name in ("learner/version", "learner/policy_lag"))
         self.beat(
             run,
             env_steps_per_s=metrics["time/env_steps_per_s"],
-            policy_version=int(metrics.get("learner/version", self._status.policy_version)),
-            policy_lag=metrics.get("learner/policy_lag", 0.0),
+            policy_version=self._status.policy_version if version is None else int(version),
+            policy_lag=lag or 0.0,
         )
 
     def beat(self, run: Run, **changes: Any) -> None:

@@ -35,6 +35,8 @@ NUM_SNAPSHOTS = 10
 """Snapshots of what was learned, evenly over a run's env steps; one of it untrained comes before them."""
 MAX_IDLE = 1000
 """Iterations in a row without env steps: a run of them would never end."""
+_OWN = ("time/wall_s", "time/env_steps_per_s")
+"""Metrics that a run adds."""
 _GOAL_COLUMNS = 7
 """Of ``Iteration.goals``."""
 BEAT_S = 1.0
@@ -104,15 +106,8 @@ class Run:
         if saved is None:
             check_members(type(method), Method, _REPLACEABLE)
         self._expect(hasattr(method, "timing"), "build", method, "one whose __init__ calls super().__init__()")
-        if hidden := [name for name in vars(method) if callable(getattr(Method, name, None))]:
-            raise CodeError(
-                f"{self._origin}: self.{hidden[0]} hides {hidden[0]}() of every Method; give it another name, such as "
-                f"self._{hidden[0]}"
-            )
-        self._expect(
-            isinstance(method.timing, Timing), "self.timing", method.timing, "it another name, such as _timing"
-        )
         self.method = method
+        self._check_attributes()
         method.on_wait = self._beat
         try:
             if saved is not None:
@@ -132,7 +127,7 @@ class Run:
                 if parent is not None:
                     directory.write_published(parent)
         except BaseException:
-            method.close()
+            self.close()
             raise
 
     @property
@@ -178,7 +173,9 @@ class Run:
         try:
             with self.naming_errors():
                 self.method.close()
-        except CodeError as error:
+        except TandemError as error:
+            if self._origin is None:
+                raise
             _logger.warning("%s; what the run has learned is there", error)
 
     def _stop_reason(self) -> str | None:
@@ -201,7 +198,7 @@ class Run:
             if ended is not None and interval and self.iteration % interval == 0:
                 with method.timing("evaluate"), self.naming_errors():
                     evaluated = self.numbers("evaluate", method.evaluate())
-                    self._refuse("evaluate", evaluated.keys() & {*INDEX})
+                    self._refuse("evaluate", evaluated.keys() & {*INDEX, *_OWN})
         except (DivergedError, PolicyError) as error:
             raise self._diverged(error, played) from error
         except CodeError as error:
@@ -216,7 +213,7 @@ class Run:
         self.wall_s += self._iteration_s
         speed = (self.num_env_steps - before) / self._iteration_s
         self._iteration_s = 0.0
-        times = {"time/wall_s": self.wall_s, "time/env_steps_per_s": speed}
+        times = dict(zip(_OWN, (self.wall_s, speed), strict=True))
         with method.timing("record"):
             self._record(ended, ended.metrics | evaluated | times)
         with self._tolerating("without this snapshot"):
@@ -240,14 +237,15 @@ class Run:
             raise CodeError(f"{self._origin}: {words}; say how many with self.count(NUMBER)")
         if self._origin is None:
             return
+        self._check_attributes()
         counted = self.iteration - played
         if counted != (ended is not None):
             given = "None" if ended is None else "an Iteration"
             raise CodeError(
-                f"{self._origin}: step counted {counted} iterations and gave {given}: call self.count(NUMBER) once for "
-                "each Iteration that it returns"
+                f"{self._origin}: step counted iterations: {counted}, and gave {given}: call self.count(NUMBER) once "
+                "for each Iteration that it returns"
             )
-        self._expect(isinstance(self.method.converged, bool | np.bool_), "converged", self.method.converged, "a bool")
+        self._expect(isinstance(self.method.converged, int | np.bool_), "converged", self.method.converged, "a bool")
         if ended is None:
             return
         self._expect(isinstance(ended, Iteration), "step", ended, "an Iteration or None")
@@ -261,14 +259,26 @@ class Run:
                 f"{self._origin}: the metrics of an Iteration lack its iteration and env_steps: begin them with what "
                 "self.count(NUMBER) gives, and leave these two as they are"
             )
+        self._expect(isinstance(ended.diverged, Mapping), "the Iteration's diverged", ended.diverged, "none")
         goals = ended.goals
-        if goals is not None and (
-            not isinstance(goals, np.ndarray) or goals.ndim != 2 or goals.shape[1] != _GOAL_COLUMNS
-        ):
+        if goals is None:
+            return
+        self._expect(isinstance(goals, np.ndarray), "the Iteration's goals", goals, "an array, or None")
+        if goals.ndim != 2 or goals.shape[1] != _GOAL_COLUMNS or goals.dtype.kind not in "fiu":
             raise CodeError(
-                f"{self._origin}: the goals of an Iteration are {getattr(goals, 'shape', goals)!r}; give an array of "
+                f"{self._origin}: the goals of an Iteration are {goals.dtype} of shape {goals.shape}; give numbers of "
                 f"shape (M, {_GOAL_COLUMNS}), or None"
             )
+
+    def _check_attributes(self) -> None:
+        """Refuse attributes of a user's method that hide what the run calls."""
+        if hidden := [name for name in vars(self.method) if callable(getattr(Method, name, None))]:
+            raise CodeError(
+                f"{self._origin}: self.{hidden[0]} hides {hidden[0]}() of every Method; give it another name, such as "
+                f"self._{hidden[0]}"
+            )
+        timing = self.method.timing
+        self._expect(isinstance(timing, Timing), "self.timing", timing, "it another name, such as _timing")
 
     def _refuse(self, verb: str, names: Collection[str]) -> None:
         """Refuse metrics of a user's method that the run has itself."""
@@ -351,10 +361,10 @@ class Run:
             with self.naming_errors():
                 state = self.method.state()
             self._expect(isinstance(state, Mapping), "state", state, "arrays and plain values by name")
-            arrays, values = flatten(state)
             if self._origin is not None:
                 with self._saving("state"):
                     check_comes_back(state)
+            arrays, values = flatten(state)
             directory.check_owner()
             directory.sync()
             meta = {

@@ -56,7 +56,7 @@ class StopSignals:
     def __enter__(self) -> Self:
         if current_thread() is not main_thread():
             raise TandemError(
-                "training needs the main thread, as no other gets signals: call it there, or in a process of its own"
+                "this needs the main thread, as no other gets signals: call it there, or in a process of its own"
             )
         self._pid = os.getpid()
         for number in self._previous:
@@ -83,9 +83,10 @@ class StopSignals:
             self._ask = None
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if os.getpid() != self._pid:  # a process that a user's method forked, to which none of this applies
-            signal.signal(number, self._previous[signal.Signals(number)])
-            os.kill(os.getpid(), number)
+        if os.getpid() != self._pid:  # a process that a user's method forked
+            if number == signal.SIGTERM:  # which is for it alone; the others tell a whole terminal
+                signal.signal(number, signal.SIG_DFL)
+                os.kill(os.getpid(), number)
             return
         if number in _MAY_COME_TWICE and self.first is not None:
             return

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from service.base.tensors import split_parts
+from service.base.tensors import DTYPES, split_parts
 from service.base.types import Arrays
 from service.methods.method import State
 
@@ -19,11 +19,16 @@ def check_comes_back(state: State) -> None:
     """Refuse what a checkpoint would give back as something else.
 
     Raises:
-        ValueError: a component with a slash in its name, keys that are no text, a tuple, or an object.
+        ValueError: a name or key that is no text, empty or has a slash; a tuple; an array of what is no number; or an
+            object.
     """
     for name, part in state.items():
-        if "/" in name or not name:
-            raise ValueError(f"{name!r} has a slash, or no letters")
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"the name {name!r} is no text")
+        if "/" in name:
+            raise ValueError(f"{name!r} has a slash")
+        if name == _LOOSE:
+            raise ValueError(f"the name {name!r} is used here")
         _check_plain(name, part)
 
 
@@ -40,7 +45,11 @@ def _check_plain(name: str, part: object) -> None:
     elif isinstance(part, list):
         for each in part:
             _check_plain(name, each)
-    elif not isinstance(part, np.ndarray | np.generic | str | int | float | None):
+    elif isinstance(part, np.ndarray | np.generic):
+        if part.dtype.name not in DTYPES or isinstance(part, np.ma.MaskedArray):
+            what = "a mask" if isinstance(part, np.ma.MaskedArray) else f"dtype {part.dtype}"
+            raise ValueError(f"{name!r} has an array with {what}; use one of {', '.join(DTYPES)}")
+    elif not isinstance(part, str | int | float | None):
         raise ValueError(f"{name!r} has a {type(part).__name__}")
 
 

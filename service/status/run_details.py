@@ -73,8 +73,8 @@ def _study_options(path: Path) -> list[str]:
 
 def _uses(run: RunStatus, path: Path, place: list[str], config: dict[str, Any]) -> tuple[RunCommand, ...]:
     """The commands that use what a run has learned, but for those that its method refuses."""
-    if parse_reference(str(config.get("method"))) is not None:  # a method of a user's makes nothing of a known kind
-        return ()
+    if parse_reference(str(config.get("method"))) is not None and not config.keys() & {"policy", "skills", "task"}:
+        return ()  # a method of a user's that makes nothing of a known kind
     refused = set()
     skills = config.get("skills")
     if isinstance(skills, dict) and skills.get("zero_shot") == "none":  # no skill leads to a goal

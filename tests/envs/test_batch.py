@@ -1,9 +1,11 @@
 """The contract of a batch: worlds are independent, exact to save and restore, and loud about bad input."""
 
+import copy
+
 import numpy as np
 import pytest
 
-from service.base.errors import DivergedError
+from service.base.errors import DivergedError, TandemError
 from service.config import WorkspaceConfig, WorldConfig
 from service.envs.batch import WorldBatch
 from service.envs.panda import FINGER_STROKE_M
@@ -221,3 +223,17 @@ class TestBlockedGrippers:
             assert (np.abs(some.positions()[blocked, self.FINGERS]) < 2e-3).all()
             assert (some.states[:, -1] == blocked).all()
         assert (some.positions()[~blocked, self.FINGERS] > 0.03).all()
+
+
+def test_a_copy_keeps_what_its_worlds_remember_and_whether_it_is_closed():
+    with WorldBatch(WorldConfig(), 2, blocked_fraction=0.5) as worlds:
+        worlds.blocked_fraction = 0.0  # as self-play does for its first games
+        worlds.reset(np.random.default_rng(0))
+        other = copy.deepcopy(worlds)
+        assert (other.blocked_fraction, other.layout["gripper_blocked"]) == (0.0, worlds.layout["gripper_blocked"])
+        assert np.array_equal(other.states, worlds.states)
+        other.states[:] = 0.0
+        assert worlds.states.any()
+    with pytest.raises(TandemError, match="closed"):
+        copy.deepcopy(worlds).step(np.zeros((2, 4), np.float32))
+    other.close()

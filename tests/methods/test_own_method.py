@@ -140,15 +140,19 @@ def test_a_key_of_one_method_is_unknown_to_another(file, method, key, said):
         ("count(10)", "count(0.5)", "mine.py:15: TypeError: 'float' object cannot be interpreted as an integer"),
         ("return Climb(self)", "return 3", "mine.py: build gave a int; give a Method"),
         ("super().__init__()", "pass", "mine.py: build gave a Climb; give one whose __init__ calls super().__init__()"),
-        ("self.count(10) | {", "{", "step counted 0 iterations and gave an Iteration: call self.count(NUMBER) once"),
-        ("return Iteration(", "Iteration(", "step counted 1 iterations and gave None: call self.count(NUMBER) once"),
-        ("self.count(10) | {", "self.count(0) | self.count(10) | {", "step counted 2 iterations and gave an Iteration"),
+        ("self.count(10) | {", "{", "step counted iterations: 0, and gave an Iteration: call self.count(NUMBER) once"),
+        ("return Iteration(", "Iteration(", "step counted iterations: 1, and gave None: call self.count(NUMBER) once"),
+        (
+            "self.count(10) | {",
+            "self.count(0) | self.count(10) | {",
+            "step counted iterations: 2, and gave an Iteration",
+        ),
         ('"climb/height": self.height', '"env_steps": 7', "lack its iteration and env_steps: begin them with what"),
         ('"climb/height": self.height', '"iteration": float("nan")', "lack its iteration and env_steps"),
         (
             "self.height})",
             "self.height}, np.zeros((5, 3)))",
-            "the goals of an Iteration are (5, 3); give an array of shape",
+            "the goals of an Iteration are float64 of shape (5, 3); give numbers of shape (M, 7)",
         ),
         (
             "self.height += ",
@@ -179,6 +183,23 @@ def test_a_key_of_one_method_is_unknown_to_another(file, method, key, said):
             "mine.py: state gave what cannot be saved: 'rng' has a object; give arrays of numbers, and of a state",
         ),
         ('"rng": self', '"n/rng": self', "mine.py: state gave what cannot be saved: 'n/rng' has a slash"),
+        ('"rng": self', '"&": self', "mine.py: state gave what cannot be saved: the name '&' is used here"),
+        ('"rng": self', "1: self", "mine.py: state gave what cannot be saved: the name 1 is no text"),
+        (
+            '"rng": self',
+            '"odd": [np.zeros(2, complex)], "rng": self',
+            "'odd' has an array with dtype complex128; use one",
+        ),
+        (
+            "def close",
+            "def start(self, state=None):\n        raise ValueError('real')\n\n    def close",
+            "ValueError: real",
+        ),
+        (
+            "return Iteration(",
+            "self.health = 3; return Iteration(",
+            "mine.py: self.health hides health() of every Method",
+        ),
         (
             '"rng": self.rng.bit_generator.state',
             '"rng": [{"n": (1, 2)}]',
@@ -226,6 +247,24 @@ def test_its_result_is_there_whatever_its_end_raises(file, tmp_path, caplog):
     assert [each.message for each in caplog.records if "bad end" in each.message] == [
         "mine.py:30: ValueError: bad end; what the run has learned is there"
     ]
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_an_error_at_its_start_is_not_hidden_by_one_at_its_end(file, tmp_path):
+    text = CODE.replace("def close(self):\n        pass", 'def close(self):\n        raise KeyError("end")')
+    file.write_text(
+        text.replace("def measure", 'def start(self, state=None):\n        raise ValueError("real")\n\n    def measure')
+    )
+    with pytest.raises(ConfigError, match="ValueError: real"):
+        train(config_of(), RunDirectory(tmp_path / "run"), tmp_path / "registry", on_iteration=ignore)
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_metrics_of_the_status_may_be_nan(file, tmp_path):
+    text = CODE.replace('"climb/height": self.height', '"learner/version": float("nan"), "learner/policy_lag": None')
+    file.write_text(text)
+    train(config_of(), RunDirectory(tmp_path / "run"), tmp_path / "registry", on_iteration=ignore)
+    assert (read_status(tmp_path / "run").policy_version, read_status(tmp_path / "run").policy_lag) == (0, 0.0)
 
 
 @pytest.mark.usefixtures("default_signals")

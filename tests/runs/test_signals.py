@@ -97,12 +97,13 @@ def test_after_the_question_a_signal_raises_again():
             send(signal.SIGINT)
 
 
-def test_a_forked_process_ends_by_a_signal_as_it_did_before():
-    """As those of ``multiprocessing.Pool`` in a method of a user's, which are ended by SIGTERM."""
+def test_a_forked_process_ends_by_its_own_signal_alone():
+    """As one of ``multiprocessing.Pool`` in a method of a user's: SIGTERM ends it, Ctrl-C in a terminal does not."""
     with StopSignals() as signals, signals.asking(lambda: None):
         child = os.fork()
         if not child:
-            os.kill(os.getpid(), signal.SIGTERM)
+            for number in (signal.SIGINT, signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
+                os.kill(os.getpid(), number)
             os._exit(0)
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGTERM
         assert signals.first is None
@@ -111,7 +112,7 @@ def test_a_forked_process_ends_by_a_signal_as_it_did_before():
 def test_another_thread_gets_no_signals_and_is_told_so():
     with ThreadPoolExecutor(1) as threads, pytest.raises(TandemError) as error:
         threads.submit(StopSignals().__enter__).result()
-    assert_one_line(error.value, "training needs the main thread", "in a process of its own")
+    assert_one_line(error.value, "this needs the main thread", "in a process of its own")
 
 
 def test_a_signal_that_somebody_swallowed_is_not_forgotten():

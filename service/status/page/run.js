@@ -54,7 +54,7 @@ class RunPage {
     };
     for (const name of run.trial ? ["space", "map", "actors"] : []) delete parts[name]; // which self-play has
     const [name, published] = run.trial ? (run.trial.primitives ?? "").split("@") : [run.name, NAME.test(run.name)];
-    this.ofSelfPlay = [parts.space?.root, parts.map?.root, this.summary.bob.root, this.summary.tiles.lag.root].filter(Boolean);
+    this.parts = parts;
     this.primitives = published ? new Versions(name, `Primitives ${name}`) : null;
     parts.curves.body.append(this.board.root);
     this.actorsBody = parts.actors?.body;
@@ -63,10 +63,20 @@ class RunPage {
     this.ask(bodies);
   }
 
+  /** Leave out what only self-play has, where the run is of another method and has nothing of it. */
+  fit() {
+    const { isOther } = this.board;
+    const { space, map } = this.parts;
+    if (space) space.root.hidden = isOther && !this.space.frames.length;
+    if (map) map.root.hidden = isOther && !map.body.contains(this.goals.root);
+    for (const each of [this.summary.bob, this.summary.tiles.lag]) each.root.hidden = isOther;
+  }
+
   ask(bodies) {
     const { signal, runId } = this;
     const part = (...names) => get(["v1", "runs", runId, ...names], [], signal);
-    const keep = (milliseconds, name, shown, ...path) => bodies[name] && every(milliseconds, signal, () => show(bodies[name], shown, () => part(...path)));
+    const keep = (milliseconds, name, shown, ...path) =>
+      bodies[name] && every(milliseconds, signal, () => show(bodies[name], shown, () => part(...path)).then(() => this.fit()));
     keep(GOALS_MS, "map", this.goals, "goals");
     keep(FILES_MS, "space", this.space, "goals", "history");
     keep(FILES_MS, "media", this.media, "files");
@@ -103,7 +113,7 @@ class RunPage {
       do {
         this.again = false;
         await this.board.refresh();
-        for (const each of this.ofSelfPlay) each.hidden = this.board.isOther;
+        this.fit();
         this.missed = false;
         this.summary.trouble(null);
         this.summary.success((await this.board.newest([BOB])).get(this.runId));
