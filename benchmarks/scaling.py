@@ -205,8 +205,8 @@ def _model_of(costs: Costs, num_updates: float, goal: str) -> str:
 def words(result: Mapping[str, Any]) -> str:
     """The same in a sentence, for the README."""
     return (
-        f"By a model of measured costs a run with one cube gains {_until(Costs.of(result['one_box']))}; "
-        "use further ones for more seeds ([scaling](docs/scaling.md))."
+        f"By a model of measured costs a run with one cube gains {_until(Costs.of(result['one_box']))}. "
+        "Use further cores for more seeds ([scaling](docs/scaling.md))."
     )
 
 

@@ -188,12 +188,12 @@ def why_alice_words(studies: Mapping[str, Mapping[str, Any]]) -> str:
     mean = {name: f"{fmean(each):.0f} %" for name, each in rates.items()}
     random, num_seeds = rates["uniform-new-alice"], len(rates["recipe"])
     return (
-        f"[Why Alice](docs/results/pretraining.md#why-alice)? Bob solves {mean['recipe']} of random goals; "
-        f"{mean['no-cloning']} if he clones none of her turns, "
-        f"{mean['no-difficulty']} if his failures do not pay her."
-        f"\nWith goals of the whole workspace added: {mean['uniform']} with Alice, {mean['uniform-new-alice']} "
-        f"({min(random):.0f} to {max(random):.0f} by seed) beside an Alice who does not learn, "
-        f"{mean['uniform-alone']} without her (means of {num_seeds} seeds)."
+        f"[Why Alice](docs/results/pretraining.md#why-alice): Bob solves {mean['recipe']} of random goals; "
+        f"{mean['no-cloning']} without cloning her turns; "
+        f"{mean['no-difficulty']} if she earns nothing by his failures."
+        f"\nIf goals from the whole workspace are added, he solves {mean['uniform']}; {mean['uniform-new-alice']} "
+        f"({min(random):.0f} to {max(random):.0f} by seed) if Alice does not learn, "
+        f"{mean['uniform-alone']} without Alice (means of {num_seeds} seeds)."
     )
 
 

@@ -35,16 +35,16 @@ def ahead_words(results: Sequence[Result], composing: str, task: str) -> str:
     most, where = f"{100 * LEVEL:.0f} points or more", find_task(task).title
     if not len(ahead):
         return f"On *{where}* composing is never {most} ahead of learning from nothing; at the end {end}."
-    when = f"the last time by {most} after {round(steps[ahead[-1]], -3):,} env steps"
-    return f"On *{where}* composing is ahead of learning from nothing, {when}; at the end {end}."
+    when = f"at {round(steps[ahead[-1]], -3):,} env steps"
+    return f"On *{where}* composing is last ahead of learning from nothing by {most} {when}. At the end {end}."
 
 
 def longer_words(longer: Sequence[Result], more_updates: Sequence[Result]) -> str:
     """Where and when learning from nothing becomes good in longer trials, and with more updates: a line for each."""
-    more, words = f"with {MANY_UPDATES} updates for 64 env steps instead of 8, ", list[str]()
-    for budget, trials in (("", longer), (more, more_updates)):
-        if places := _good_places(trials):
-            words.append(f"{budget}{places}")
+    words = list[str]()
+    for updates, trials in ((8, longer), (MANY_UPDATES, more_updates)):
+        if places := _good_places(trials, f"{updates} updates for 64 env steps"):
+            words.append(places)
     if not words:
         return ""
     most, said = max(each["env_steps"] for each in (*longer, *more_updates)), ";\n".join(words)
@@ -66,19 +66,19 @@ def without_hindsight_words(results: Sequence[Result]) -> str:
     )
 
 
-def _good_places(trials: Sequence[Result]) -> str:
-    """Such as ``with MCP on *InAir* after 0.5 M env steps (1 seed)``: of the first method that gets there."""
+def _good_places(trials: Sequence[Result], updates: str) -> str:
+    """Such as ``with MCP and UPDATES, *InAir* after 0.5 M (1 seed)``: of the first method that gets there."""
     of = by_method_and_task(trials)
-    places = {"with MCP": list[str](), "without MCP": list[str]()}
+    places = {"with MCP and": list[str](), "without MCP, with": list[str]()}
     for task in PAPERS:
         found = {name: mean_until(of[name, task], GOOD) for name in learning(None) if (name, task) in of}
         soon = {name: steps for name, steps in found.items() if steps is not None}
         if soon:
             first = min(soon, key=lambda name: soon[name])
-            network = "with MCP" if TASK_METHODS[first].mcp_actor else "without MCP"
-            places[network].append(f"on *{find_task(task).title}* after {millions(soon[first])}")
-    words = ", ".join(f"{network} {', '.join(each)}" for network, each in places.items() if each)
-    return f"{words} env steps {_seeds_words(list(of.values()))}" if words else ""
+            network = "with MCP and" if TASK_METHODS[first].mcp_actor else "without MCP, with"
+            places[network].append(f"*{find_task(task).title}* after {millions(soon[first])}")
+    words = "; ".join(f"{network} {updates}, {', '.join(each)}" for network, each in places.items() if each)
+    return f"{words} {_seeds_words(list(of.values()))}" if words else ""
 
 
 def _means(seeds: Seeds, steps: Sequence[int]) -> FloatArray:

@@ -193,7 +193,7 @@ def test_more_cores_by_hand():
     block = scaling.model_block(measured(0.3), skill)
     assert "keeps up with 3.0 actors of 100 worlds each" in block
     assert "A run gains nothing beyond 9 cores." in block
-    assert "gains from every further core;" in scaling.words(measured(0.1))
+    assert "gains from every further core. Use" in scaling.words(measured(0.1))
     # 200 updates of .9 s are 3 minutes, of .3 s one; eight runs of 3 minutes are 160 an hour
     assert ["16", "0.30 s", "1.0", "100 %", "160"] in [line.strip("| ").split(" | ") for line in block.splitlines()]
     of_two = measured(0.3)

@@ -131,10 +131,8 @@ def test_what_alice_is_for_by_hand():
     assert len(lines) == 4
     assert why_alice_words(some) == ""
     words = why_alice_words(dict.fromkeys(ARMS, study(0.1, 0.2)) | some)
-    assert (
-        "solves 96 % of random goals; 50 % if he clones none of her turns, 15 % if his failures do not pay her" in words
-    )
-    assert "15 % with Alice, 15 % (10 to 20 by seed) beside an Alice who does not learn, 15 % without her" in words
+    assert "solves 96 % of random goals; 50 % without cloning her turns; 15 % if she earns nothing by" in words
+    assert "solves 15 %; 15 % (10 to 20 by seed) if Alice does not learn, 15 % without Alice" in words
     assert words.endswith(" (means of 3 seeds).")
 
 

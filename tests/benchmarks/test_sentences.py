@@ -31,8 +31,8 @@ def test_when_composing_is_last_ahead_by_hand(last, end):
         trial("asp-only", "push", 0, 1.0),
     ]
     assert ahead_words(results, "ours-her", "push") == (
-        "On *Push* composing is ahead of learning from nothing, the last time by 5 points or more after 38,000 env "
-        f"steps; at the end {end}."
+        "On *Push* composing is last ahead of learning from nothing by 5 points or more at 38,000 env steps. "
+        f"At the end {end}."
     )
 
 
@@ -55,9 +55,9 @@ def test_where_learning_from_nothing_becomes_good_is_of_the_first_method_that_do
     ]
     many = [trial("scratch-mcp-her", "sphere", seed, 1.0, curve(0.9, 0.9, 0.9, 0.9)) for seed in (0, 1)]
     assert longer_words(longer, many) == (
-        "In trials of 0.0512 M env steps learning from nothing reaches 90 %: without MCP on *InAir* after 0.0384 M "
-        "env steps (1 seed);\nwith 32 updates for 64 env steps instead of 8, with MCP on *Sphere* after 0.0256 M "
-        "env steps (2 seeds)."
+        "In trials of 0.0512 M env steps learning from nothing reaches 90 %: without MCP, with 8 updates for 64 env "
+        "steps, *InAir* after 0.0384 M (1 seed);\nwith MCP and 32 updates for 64 env steps, *Sphere* after 0.0256 M "
+        "(2 seeds)."
     )
     assert longer_words(longer[2:], []) == ""
 
