@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 
@@ -76,3 +77,18 @@ def episodes_table(runs: Sequence[Run]) -> str:
             most = percent(float(np.max(series["skills/outside_fraction"][late // 4 :])))
             rows.append((METHODS[method], str(run["config"]["seed"]), *shares, most))
     return table(("", "seed", *_EPISODES.values(), "most outside"), rows)
+
+
+def phi_table(result: Mapping[str, Any]) -> str:
+    """How far steps of the object go in phi, of each set of skills of ``benchmarks.steps_in_phi``."""
+    upward = [f"upward at {100 * height:g} cm" for height in result["heights_m"]]
+    rows: list[Row] = [
+        (
+            METHODS[each["method"]],
+            each["name"].rpartition("-")[2],
+            *(f"{step:.2f}" for step in (each["sideways"], *each["upward"])),
+            f"{each['table_to_top']:.1f}",
+        )
+        for each in sorted(result["skills"], key=lambda each: list(METHODS).index(each["method"]))
+    ]
+    return table(("", "seed", "sideways on the table", *upward, "from the table to the top"), rows)

@@ -1,16 +1,19 @@
 """Recorded skill-discovery runs, and self-play recorded as skills."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from benchmarks import measuring, record_run, run_files
-from benchmarks.report.skills import episodes_table
+from benchmarks.report.skills import episodes_table, phi_table
+from benchmarks.steps_in_phi import steps_in_phi
 from service.actors.coverage import skill_paths, visited_share
 from service.base.errors import TandemError
 from service.config import parse_config
 from service.config.skills import SkillsConfig
+from service.config.world import WorkspaceConfig
 from service.policies.frozen_skills import FrozenSkills
 from service.store.run_directory import RunDirectory
 from tests.methods.test_skill_run import play, small_config
@@ -71,3 +74,15 @@ def test_what_episodes_do_is_told_for_each_seed():
     series |= {"skills/moved_fraction": [0.0] * 18 + [0.5, 1.0], "skills/lifted_fraction": [1.0] * 18 + [0.0, 0.0]}
     text = episodes_table([{"method": "lsd", "config": {"seed": 3}, "series": series}])
     assert text.splitlines()[-1] == "| LSD | 3 | 75 % | - | 0 % | 30 % | 60 % |"  # raised: not recorded then
+
+
+def test_steps_in_phi_by_hand():
+    """A phi of three times the place along x, four times along y, and half of it along z; a unit is 12 cm."""
+    slopes = np.array([[3.0, 0.0, 0.0, 0.0], [0.0, 4.0, 0.0, 0.0], [0.0, 0.0, 0.5, 0.0]], dtype=np.float32)
+    skills = SimpleNamespace(network=[(slopes, np.ones(4, dtype=np.float32))])
+    found = steps_in_phi(skills, WorkspaceConfig(), num=5)
+    assert found["sideways"] == pytest.approx(3.5 * 0.02 / 0.12, rel=1e-4)
+    assert found["upward"] == pytest.approx([0.5 * 0.02 / 0.12] * 3, rel=1e-4)
+    assert found["table_to_top"] == pytest.approx(0.5 * (0.35 - 0.025) / 0.12, rel=1e-4)
+    result = {"heights_m": [0.025, 0.1, 0.2], "skills": [{"method": "lsd", "name": "cube-lsd-7", **found}]}
+    assert phi_table(result).splitlines()[-1] == "| LSD | 7 | 0.58 | 0.08 | 0.08 | 0.08 | 1.4 |"
