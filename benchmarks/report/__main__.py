@@ -28,7 +28,7 @@ from service.config import load_config
 from service.config.recipes import recipes
 
 FILES = ("env_throughput", "throughput", "world_speed", "deployed", "scaling_box", "scaling_one", "scaling_two",
-         "robots", "time_to_skill", "transfer", "transfer_champion", "demo")  # fmt: skip
+         "robots", "time_to_skill", "transfer", "transfer_champion", "demo", "steps_in_phi")  # fmt: skip
 """Names of the recorded files of which there is one each."""
 PAGES = {
     "results/pretraining.md": (
@@ -40,7 +40,7 @@ PAGES = {
     ),
     "results/pretraining-v1.md": ("tasks", "curves", "curriculum", "coverage", "throughput"),
     "results/deployed.md": ("checks",),
-    "results/skills.md": ("today", "coverage", "curves"),
+    "results/skills.md": ("today", "phi", "coverage", "curves"),
     "results/comparison.md": ("rows", "longer", "below", "harder", "missing"),
     "downstream.md": ("headline",),
     "robots.md": ("robots",),
@@ -124,7 +124,8 @@ class Report:
         made = measured_blocks(found) | {
             "results/pretraining.md": pretraining_blocks(found, seeds, why),
             "results/pretraining-v1.md": self.earlier_blocks(runs, found),
-            "results/skills.md": self.skills_blocks(earlier_skills, skills_today),
+            "results/skills.md": self.skills_blocks(earlier_skills, skills_today)
+            | {"phi": [skills.phi_table(found["steps_in_phi"])]},
             "results/comparison.md": self.comparison_blocks(trials),
             "downstream.md": {"headline": [headline]},
             "../README.md": {
