@@ -52,12 +52,9 @@ class DirectoryLock:
             directory.mkdir(parents=True, exist_ok=True)
             self._file = open_to_append(path)
         try:
-            taken = _take(self._file, fcntl.LOCK_EX, WAIT_S)
+            taken = take(self._file, path, WAIT_S)
         except OSError as error:
             self._file.close()
-            if os.environ.get(WITHOUT_LOCKS) == "1":
-                _logger.warning("%s: no locks there (%s), as %s says", path, error.strerror, WITHOUT_LOCKS)
-                return
             raise RunTakenError(
                 f"{path}: its file system has no locks ({error.strerror}), so nothing keeps a second process out; use "
                 f"another directory, or see to it that there is only one and set {WITHOUT_LOCKS}=1"
@@ -83,6 +80,21 @@ class DirectoryLock:
                 self._path.unlink()
                 self._path.parent.rmdir()
         self._file.close()
+
+
+def take(file: FileIO, path: Path, wait_s: float) -> bool:
+    """Take the exclusive lock of an open file, until it is closed; whether that went within ``wait_s``.
+
+    Raises:
+        OSError: its file system has no locks, and ``TANDEM_WITHOUT_LOCKS`` does not say that this is known.
+    """
+    try:
+        return _take(file, fcntl.LOCK_EX, wait_s)
+    except OSError as error:
+        if os.environ.get(WITHOUT_LOCKS) != "1":
+            raise
+        _logger.warning("%s: no locks there (%s), as %s says", path, error.strerror, WITHOUT_LOCKS)
+        return True
 
 
 def is_locked(directory: Path) -> bool:
@@ -120,14 +132,15 @@ def claim_epoch(directory: Path) -> int:
     Raises:
         StorageError: it cannot be claimed.
     """
+    numbers = directory / EPOCHS
     while True:
-        number = newest_epoch(directory) + 1
+        with os_errors("write", numbers):
+            numbers.mkdir(parents=True, exist_ok=True)
+            number = _newest(numbers) + 1
         path = _epoch_file(directory, number)
-        with os_errors("write", path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with contextlib.suppress(FileExistsError):  # another process was quicker
-                path.touch(exist_ok=False)
-                return number
+        with os_errors("write", path), contextlib.suppress(FileExistsError):  # another process was quicker
+            path.touch(exist_ok=False)
+            return number
 
 
 def give_back_epoch(directory: Path, number: int) -> None:
@@ -140,10 +153,13 @@ def give_back_epoch(directory: Path, number: int) -> None:
 def newest_epoch(directory: Path) -> int:
     """The highest number that was claimed in a run directory; 0 where there is none."""
     try:
-        names = os.listdir(directory / EPOCHS)
+        return _newest(directory / EPOCHS)
     except OSError:
         return 0
-    return max((int(name) for name in names if name.isdecimal()), default=0)
+
+
+def _newest(numbers: Path) -> int:
+    return max((int(name) for name in os.listdir(numbers) if name.isdecimal()), default=0)
 
 
 def _epoch_file(directory: Path, number: int) -> Path:

@@ -13,6 +13,8 @@ from service.base.errors import one_line
 from service.cluster.ray_connection import num_gpus
 from service.runs.study_run import END_NOW, GO_ON, POLL_S, STOP, Asked, Job, Place, StudyRun, run_process
 
+ENVIRONMENT = {"env_vars": {"RAY_kill_child_processes_on_worker_exit": "0"}}
+"""Of a task: when its driver dies Ray would kill the training, which notices that itself and saves."""
 MAX_RETRIES = 3
 """Times that a task is tried again whose machine was lost; it goes on where the new one sees the same directory."""
 
@@ -23,8 +25,10 @@ def run_as_task(job: Job, asked: Asked) -> StudyRun:
     Returns:
         How the run was left.
     """
-    task = ray.remote(num_cpus=job.num_cores, num_gpus=num_gpus(job.device), max_retries=MAX_RETRIES)(run_here)
-    reference: Any = task.remote(job)
+    needs = ray.remote(
+        num_cpus=job.num_cores, num_gpus=num_gpus(job.device), max_retries=MAX_RETRIES, runtime_env=ENVIRONMENT
+    )
+    reference: Any = needs(run_here).remote(job)
     told = GO_ON
     while not ray.wait([reference], timeout=POLL_S)[0]:
         if (now := asked()) > told:

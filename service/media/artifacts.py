@@ -50,6 +50,8 @@ def make_artifacts(directory: RunDirectory, registry: Path | str = "registry") -
             files[name] = make()
         except TandemError as error:
             _logger.warning("no %s: %s", name, error)
+        except Exception as error:  # whatever a library raises, what was learned is saved and published
+            _logger.warning("no %s: %s: %s", name, type(error).__name__, error, exc_info=error)
     return files
 
 

@@ -13,7 +13,6 @@ A publish writes the blob, then the manifest, then the aliases, each atomically:
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -26,7 +25,7 @@ import numpy as np
 from service.base import tensors
 from service.base.errors import DamagedBlobError, RegistryError, StorageError, UnknownVersionError, did_you_mean
 from service.base.files import open_to_append, os_errors, read_regular, write_atomic, write_exclusive
-from service.base.lock import LOCK_FILE
+from service.base.lock import LOCK_FILE, take
 from service.base.version import git_commit
 from service.registry import names
 from service.registry.manifest import Manifest, make_manifest, read_manifest
@@ -36,6 +35,8 @@ MAX_ALIAS_BYTES = 100
 """Of an alias' file, which holds a number."""
 MAX_BLOB_BYTES = 1024**3
 """The largest primitives there are have about a megabyte."""
+_WAIT_S = 5.0
+"""For another process that moves an alias, which takes milliseconds."""
 READ_ONLY_FILE = "READ_ONLY"
 EXPORTED_MANIFEST, EXPORTED_PARAMETERS = "manifest.json", "primitives.safetensors"
 """Files of an exported version."""
@@ -353,7 +354,8 @@ class Registry:
         with os_errors("write", path):
             directory.mkdir(parents=True, exist_ok=True)
             with open_to_append(directory / LOCK_FILE) as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)  # closing the file frees it, and so does the process's death
+                if not take(lock, directory / LOCK_FILE, _WAIT_S):
+                    raise StorageError(f"another process holds {directory / LOCK_FILE}; end it, or try again")
                 if back or (self._read_alias(name, alias) or 0) < number:
                     write_atomic(path, f"{number}\n".encode())
 

@@ -10,7 +10,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as InPath
 
-from service.base.errors import DamagedBlobError, FormatVersionError, RegistryError, StorageError
+from service.base.errors import RegistryError, StorageError
 from service.base.parsing import NAME
 from service.registry.bundled import BUNDLED, find_version, is_bundled
 from service.registry.manifest import Manifest
@@ -174,7 +174,7 @@ class Shelf:
         try:
             manifest = registry.manifest(str(version))
             said = manifest.model_dump(include=set(VersionSummary.model_fields) - {"version"}) | _lineage(manifest)
-        except (DamagedBlobError, FormatVersionError) as error:  # must not hide the other versions
+        except StorageError as error:  # must not hide the other versions
             said = {"problem": str(error)}
         place = {"version": version.number, "origin": origin, "directory": str(registry.root)}
         return VersionSummary.model_validate({**place, "aliases": aliases, **said})

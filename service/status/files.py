@@ -126,7 +126,8 @@ def file_response(
     """
     headers = {"cache-control": cache, **({"etag": f'"{etag}"'} if etag else {})}
     try:
-        status = path.stat()
+        with path.open("rb") as file:
+            status = os.fstat(file.fileno())
     except OSError as error:
         raise ProblemError(404, "no-such-file", f"{path.name} cannot be read: {error.strerror}") from None
     response = FileResponse(path, headers=headers, media_type=media_type, stat_result=status)

@@ -9,7 +9,9 @@
 Where Redis has another run with the same id, one of the two is shown, the directory's unless only the other one is
 active, and only this one is asked to stop.
 
-If Redis is unavailable, everything in the directories can still be read, and each active run has a warning.
+If Redis is unavailable, everything in the directories can still be read, and each active run has a warning. Runs that
+only Redis had are shown as they were last, and their metrics are unavailable; a run that nothing is known of may be
+one of its own.
 """
 
 from __future__ import annotations
@@ -57,11 +59,16 @@ class CombinedReader(RunReader):
         self._disk, self._redis, self._clock = disk, redis, clock
         self._failure: tuple[float, str] | None = None
         """Time and reason of the last failure of Redis; None while it answers."""
+        self._in_redis: dict[str, RunStatus] = {}
+        """Its runs by their ids, when it answered last."""
 
     @override
     def runs(self) -> list[RunStatus]:
         on_disk = {run.run_id: run for run in self._disk.runs()}
-        in_redis = {run.run_id: run for run in self._ask_redis(self._redis.runs) or ()}
+        if (answer := self._ask_redis(self._redis.runs)) is not None:
+            self._in_redis = {run.run_id: run for run in answer}
+        away = self._failure is not None  # then what it had last is older than what is in directories
+        in_redis = {run_id: run for run_id, run in self._in_redis.items() if not (away and run_id in on_disk)}
         merged = [self._merge(on_disk.get(run_id), in_redis.get(run_id)) for run_id in on_disk.keys() | in_redis.keys()]
         return sorted(merged, key=lambda run: (run.started, run.run_id), reverse=True)
 
@@ -70,16 +77,20 @@ class CombinedReader(RunReader):
         try:
             on_disk = self._disk.run(run_id)
         except UnknownRunError:
-            if (in_redis := self._ask_redis(lambda: self._redis.run(run_id))) is None:
+            if (in_redis := self._ask_redis(lambda: self._redis.run(run_id))) is not None:
+                return in_redis
+            if self._failure is None:
                 raise
-            return in_redis
+            if run_id not in self._in_redis:
+                raise self._away() from None
+            return self._merge(None, self._in_redis[run_id])
         with suppress(DamagedStoreError):
             return self._merge(on_disk, self._ask_redis(lambda: self._redis.run(run_id)))
         return on_disk
 
     @override
-    def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
-        return self._disk_first(lambda reader: reader.metrics(run_id, after_iteration=after_iteration))
+    def metrics(self, run_id: str, *, after_iteration: int = 0, most: int | None = None) -> list[Record]:
+        return self._disk_first(lambda reader: reader.metrics(run_id, after_iteration=after_iteration, most=most))
 
     @override
     def newest(self, run_id: str) -> Record | None:
@@ -103,8 +114,11 @@ class CombinedReader(RunReader):
         in_redis = self._ask_redis(lambda: self._redis.run(run_id))
         if in_redis is not None and not _are_two(shown, in_redis):
             self._ask_redis(lambda: self._redis.request_stop(run_id))
-        with suppress(UnknownRunError):  # of a run on another machine
+        try:
             self._disk.request_stop(run_id)
+        except UnknownRunError:  # of a run on another machine
+            if self._failure is not None:
+                raise self._away() from None
 
     @override
     def ready(self) -> None:
@@ -138,9 +152,15 @@ class CombinedReader(RunReader):
             return question(self._disk)
         except UnknownRunError:
             in_redis = self._ask_redis(lambda: question(self._redis))
+            if in_redis is None and self._failure is not None:
+                raise self._away() from None
             if in_redis is None:
                 raise
             return in_redis
+
+    def _away(self) -> StoreUnavailableError:
+        reason = "" if self._failure is None else self._failure[1]
+        return StoreUnavailableError(f"no directory here has this run, and Redis is away: {reason}")
 
     def _ask_redis(self, question: Callable[[], _Answer]) -> _Answer | None:
         """Ask Redis; None if it does not know the run, or is unavailable."""

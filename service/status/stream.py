@@ -20,6 +20,8 @@ from service.store.models import ACTIVE, RunReader, RunStatus
 
 POLL_S = 0.5
 MAX_STREAMS = 64
+MAX_RECORDS = 1_000
+"""Read at once, some 6 MB: a client that comes back after a night has the others by and by."""
 MAX_AGE_S = 3600.0
 """Streams end after this time and browsers reconnect, so a client that silently disappeared is not served for ever."""
 _RETRY_MS = 2000
@@ -43,6 +45,7 @@ class RunFollower:
         """That the client has; None: it begins with the newest."""
         self._status: RunStatus | None = None
         self._unavailable = False
+        self._has_more = False
         self.ended = False
 
     def poll(self) -> list[ServerSentEvent]:
@@ -59,7 +62,7 @@ class RunFollower:
         if status != self._status:
             self._status = status
             events.append(ServerSentEvent(event="status", data=status))
-        if status.state not in ACTIVE:
+        if status.state not in ACTIVE and not self._has_more:
             self.ended = True
             events.append(ServerSentEvent(event="end", data=status))
         return events
@@ -68,7 +71,9 @@ class RunFollower:
         # also read the last record that was sent: it is gone if the run was resumed from an earlier iteration
         if self._last_iteration is None:
             self._last_iteration = max(0, self._newest_iteration() - 1)
-        records = self._runs.metrics(self._run_id, after_iteration=max(0, self._last_iteration - 1))
+        after = max(0, self._last_iteration - 1)
+        records = self._runs.metrics(self._run_id, after_iteration=after, most=MAX_RECORDS)
+        self._has_more = len(records) == MAX_RECORDS
         events = []
         if self._last_iteration and not records:
             self._last_iteration = self._newest_iteration()

@@ -135,9 +135,9 @@ class DiskReader(RunReader):
         return self._status(run_id, self._find(run_id))
 
     @override
-    def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
+    def metrics(self, run_id: str, *, after_iteration: int = 0, most: int | None = None) -> list[Record]:
         with self._using(run_id) as path:
-            return self._records_of(path).after(after_iteration)
+            return self._records_of(path).after(after_iteration, most)
 
     @override
     def newest(self, run_id: str) -> Record | None:
@@ -176,7 +176,7 @@ class DiskReader(RunReader):
     @override
     def request_stop(self, run_id: str) -> None:
         with self._using(run_id) as path:
-            if self._status(run_id, path).state in ACTIVE:
+            if self._read_status(run_id, path).state in ACTIVE:
                 (path / STOP_FILE).touch()
 
     @override
@@ -192,6 +192,7 @@ class DiskReader(RunReader):
             is_young = self._clock() - read_s < SILENT_AFTER.total_seconds()
             if isinstance(error, OSError) and error.errno in _PASSING and last is not None and is_young:
                 return last.suffering("well", f"{STATUS_FILE} cannot be read right now: {error.strerror}")
+            self.ready()  # or nothing is wrong with this run alone
             return _damaged(run_id, path, f"{path} cannot be read: {one_line(str(error), 300)}")
         if (number := self._records_of(path).num_passed_over) > 0:
             status = status.suffering("well", f"metrics.jsonl: lines that are no records and are passed over: {number}")

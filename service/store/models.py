@@ -250,8 +250,11 @@ class RunReader(ABC):
         """One run."""
 
     @abstractmethod
-    def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
-        """The records of iterations above ``after_iteration``, in order, each iteration once (a resumed run's last)."""
+    def metrics(self, run_id: str, *, after_iteration: int = 0, most: int | None = None) -> list[Record]:
+        """The records of iterations above ``after_iteration``, in order, each iteration once (a resumed run's last).
+
+        Of ``most`` the first.
+        """
 
     @abstractmethod
     def newest(self, run_id: str) -> Record | None:

@@ -61,9 +61,9 @@ class RedisReader(RunReader):
         return self._status(run_id, text, *flags)
 
     @override
-    def metrics(self, run_id: str, *, after_iteration: int = 0) -> list[Record]:
+    def metrics(self, run_id: str, *, after_iteration: int = 0, most: int | None = None) -> list[Record]:
         self.run(run_id)  # or raise UnknownRunError
-        return list(filter(None, map(parse_record, self._lines(run_id, f"({after_iteration}"))))
+        return list(filter(None, map(parse_record, self._lines(run_id, f"({after_iteration}", most))))
 
     @override
     def newest(self, run_id: str) -> Record | None:
@@ -123,10 +123,11 @@ class RedisReader(RunReader):
         with self._address.errors():
             self._client.ping()
 
-    def _lines(self, run_id: str, first: str) -> list[bytes]:
-        """Texts of records whose iteration is at least ``first``; above it with a bracket."""
+    def _lines(self, run_id: str, first: str, most: int | None = None) -> list[bytes]:
+        """Texts of records whose iteration is at least ``first``; above it with a bracket. Of ``most`` the first."""
+        part = {} if most is None else {"start": 0, "num": most}
         with self._address.errors():
-            lines: list[bytes] = self._client.zrangebyscore(run_key(run_id, "metrics"), first, "+inf")
+            lines: list[bytes] = self._client.zrangebyscore(run_key(run_id, "metrics"), first, "+inf", **part)
         return lines
 
     def _run_ids(self) -> list[str]:

@@ -96,13 +96,13 @@ class RecordFile:
             self.num_passed_over = 0
             """Lines that are no records, of those in columns."""
 
-    def after(self, iteration: int) -> list[Record]:
-        """The records of iterations above ``iteration``, in order."""
+    def after(self, iteration: int, most: int | None = None) -> list[Record]:
+        """The records of iterations above ``iteration``, in order; of ``most`` the first."""
         with self._open() as file:
             kept = _newest(file)
             if not kept or _iteration(kept[0]) > iteration:
-                kept = _read_from(file, 0)
-        return [record for record in kept if _iteration(record) > iteration]
+                kept = _read_from(file, 0, iteration, most)
+        return [record for record in kept if _iteration(record) > iteration][:most]
 
     def newest(self) -> Record | None:
         """The last record."""
@@ -188,8 +188,8 @@ def _newest(file: BinaryIO) -> list[Record]:
     return kept
 
 
-def _read_from(file: BinaryIO, start: int) -> list[Record]:
-    """The records after a place in a file, each iteration once."""
+def _read_from(file: BinaryIO, start: int, after: int = -1, most: int | None = None) -> list[Record]:
+    """The records behind a place in a file, each iteration once: those above ``after``, and of ``most`` the first."""
     file.seek(start)
     if start:
         file.readline(_MAX_LINE_BYTES)  # the rest of a line
@@ -197,5 +197,8 @@ def _read_from(file: BinaryIO, start: int) -> list[Record]:
     for record in filter(None, map(parse_record, _lines(file))):
         while kept and _iteration(kept[-1]) >= _iteration(record):
             kept.pop()
-        kept.append(record)
+        if _iteration(record) > after:
+            kept.append(record)
+        if len(kept) == most:
+            break
     return kept

@@ -101,13 +101,13 @@ def test_a_file_system_without_locks_is_refused_unless_one_says_so(tmp_path, mon
 def test_each_number_is_claimed_once(tmp_path, monkeypatch):
     """Another process takes the number that this one has just seen to be free."""
 
-    def look(directory):
+    def look(numbers):
         monkeypatch.undo()
-        seen = newest_epoch(directory)
-        assert claim_epoch(directory) == 1
+        seen = newest_epoch(tmp_path)
+        assert claim_epoch(tmp_path) == 1
         return seen
 
-    monkeypatch.setattr(lock, "newest_epoch", look)
+    monkeypatch.setattr(lock, "_newest", look)
     assert claim_epoch(tmp_path) == 2
     assert (newest_epoch(tmp_path), claim_epoch(tmp_path)) == (2, 3)
 

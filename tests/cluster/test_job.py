@@ -131,8 +131,11 @@ def test_a_study_of_tasks_is_killed_with_its_driver_and_stopped_and_goes_on(head
                 wait_until_each_goes_on(driver, 1)
             finally:
                 driver.kill()
+        # Ray ends the tasks of that driver; their processes notice it, and save
+        wait_for(lambda: [each["state"] for each in statuses()] == ["interrupted", "interrupted"])
+        assert [each["iteration"] for each in statuses()] == steps_saved()
         with start(*command, "--resume", "--parallel", "2") as driver:
-            wait_until_each_goes_on(driver, 2)  # Ray ends the tasks of the first one, and with them their processes
+            wait_until_each_goes_on(driver, 2)
             driver.send_signal(signal.SIGTERM)
             said = driver.communicate(timeout=PATIENCE_S)[0]
         assert driver.returncode == 128 + signal.SIGTERM, said

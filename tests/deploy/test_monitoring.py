@@ -28,7 +28,7 @@ OTHERS = {
     "kubelet_volume_stats_capacity_bytes": {"namespace", "persistentvolumeclaim"},
 }
 FUNCTIONS = {
-    "absent", "avg_over_time", "histogram_quantile", "increase", "max_over_time", "min_over_time", "rate", "sum",
+    "absent", "avg", "avg_over_time", "histogram_quantile", "increase", "max_over_time", "min_over_time", "rate", "sum",
     "label_values", "time",
 }  # fmt: skip
 WORDS = {"and", "by", "offset", "on", "or", "unless", "le", "run"}

@@ -51,3 +51,9 @@ def test_pictures_for_which_there_is_no_room_are_left_out(directory, caplog):
         assert_one_line(message, f"no {name}", f"{name}.png", "File too large")
     assert {path: path.read_bytes() for path in directory.path.glob("*.png")} == before
     assert list(directory.path.glob(".tmp-*")) == []
+
+
+def test_an_error_of_a_library_leaves_out_its_picture_alone(directory, monkeypatch, caplog):
+    monkeypatch.setattr(artifacts, "plot_curves", lambda *_: 1 / 0)
+    assert list(make_artifacts(directory)) == ["goals", "coverage", "video"]
+    assert caplog.messages == ["no curves: ZeroDivisionError: division by zero"]

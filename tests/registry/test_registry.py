@@ -1,6 +1,7 @@
 """Versions are whole, unique, contiguous and unchanging; aliases move."""
 
 import errno
+import fcntl
 import hashlib
 import json
 import os
@@ -258,6 +259,33 @@ def test_a_full_disk_changes_nothing(
     with pytest.raises(StorageError, match="No space left on device"):
         registry.set_alias("panda-cube", "champion", 1)
     assert files_in(registry.root) == before
+
+
+def test_an_alias_whose_lock_another_process_keeps(
+    registry: Registry, publish: Publish, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish()
+    monkeypatch.setattr("service.registry.registry._WAIT_S", 0.05)
+    with (registry.root / "models" / "panda-cube" / "aliases" / ".lock").open("rb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(StorageError, match="another process holds"):
+            registry.set_alias("panda-cube", "champion", 1)
+    assert registry.set_alias("panda-cube", "champion", 1).number == 1
+
+
+def test_a_file_system_without_locks_takes_versions_where_one_says_so(
+    registry: Registry, publish: Publish, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unsupported(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr("fcntl.flock", unsupported)
+    with pytest.raises(StorageError, match="No locks available"):
+        publish()
+    monkeypatch.setenv("TANDEM_WITHOUT_LOCKS", "1")
+    assert registry.aliases("panda-cube") == {}
+    assert registry.resolve(f"panda-cube@{publish().number}")
+    assert registry.aliases("panda-cube") == {"latest": 2}
 
 
 def test_a_slow_publisher_does_not_take_latest_back(

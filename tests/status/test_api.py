@@ -7,6 +7,7 @@ import httpx
 import numpy as np
 import pytest
 
+from service.base.errors import StorageError
 from service.registry.bundled import BUNDLED
 from service.registry.manifest import parse_manifest
 from service.registry.registry import Registry
@@ -189,6 +190,19 @@ def test_a_damaged_manifest_does_not_hide_the_others(client, home):
     assert "format version" in damaged["problem"]
     answer = client.get("/v1/primitives/half/versions/1")
     assert (answer.status_code, answer.json()["type"]) == (500, "urn:tandem:other-format")
+
+
+def test_a_manifest_that_may_not_be_read_does_not_hide_the_others(client, monkeypatch):
+    manifest = Registry.manifest
+
+    def refused(registry, reference):
+        if reference == "tiny@1":
+            raise StorageError("cannot read tiny@1: Permission denied")
+        return manifest(registry, reference)
+
+    monkeypatch.setattr(Registry, "manifest", refused)
+    newest, other = client.get("/v1/primitives/tiny").json()["versions"]
+    assert (newest["problem"], other["problem"]) == (None, "cannot read tiny@1: Permission denied")
 
 
 @pytest.mark.parametrize(("version", "number"), [("1", 1), ("champion", 1), ("latest", 2)])

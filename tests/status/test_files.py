@@ -1,6 +1,9 @@
 """Ranges and entity tags of videos and blobs."""
 
+import errno
 import hashlib
+import os
+from pathlib import Path
 
 import pytest
 
@@ -54,6 +57,16 @@ def test_several_ranges(client):
     answer = client.get(URL, headers={"Range": "bytes=0-1, 500-501"})
     assert answer.status_code == 206
     assert answer.headers["content-type"].startswith("multipart/byteranges")
+
+
+def test_a_file_that_may_not_be_read(client, monkeypatch):
+    def refused(path, *_, **__):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    monkeypatch.setattr(Path, "open", refused)  # root may read everything
+    answer = client.get(URL)
+    assert (answer.status_code, answer.json()["type"]) == (404, "urn:tandem:no-such-file")
+    assert "Permission denied" in answer.json()["detail"]
 
 
 def test_pictures_of_a_studys_run(tmp_path):

@@ -4,7 +4,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from service.base.errors import DamagedStoreError, UnknownRunError
+from service.base.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError
 from service.status.run_reader import RETRY_AFTER_S, CombinedReader, open_reader
 from service.store.address import run_key
 from service.store.disk_reader import DiskReader
@@ -125,14 +125,31 @@ def test_redis_is_unavailable_and_comes_back(reader, redis, root, time_s, caplog
         reader.ready()
         assert (root / "cube" / "stop").exists()
         assert len(caplog.records) == 1  # said once, however often it is asked for
-        with pytest.raises(UnknownRunError):
-            reader.run("far")
+        for call in ("run", "metrics", "goals", "request_stop"):  # it may have a run of this name
+            with pytest.raises(StoreUnavailableError, match="Redis is away"):
+                getattr(reader, call)("far")
     finally:
         redis.revive()
     assert {run.run_id for run in reader.runs()} == {"cube", "old"}  # it is left alone for a while
     time_s[0] += RETRY_AFTER_S
     wait_until(lambda: {run.run_id for run in reader.runs()} == {"cube", "far", "old"})
     assert reader.run("cube").warnings == ()
+
+
+def test_runs_of_redis_alone_are_shown_as_they_were_last(redis, tmp_path, time_s):
+    (tmp_path / "empty").mkdir()
+    reader = CombinedReader(DiskReader(tmp_path / "empty"), RedisReader(redis.address), clock=lambda: time_s[0])
+    assert {run.run_id for run in reader.runs()} == {"cube", "far"}
+    redis.kill()
+    try:
+        shown = {run.run_id: run for run in reader.runs()}
+        assert shown["cube"].iteration == 7
+        assert "reads no Redis" in shown["cube"].warnings[0]  # so that there is an alert
+        assert reader.run("cube") == shown["cube"]
+        with pytest.raises(StoreUnavailableError):
+            reader.request_stop("cube")
+    finally:
+        redis.revive()
 
 
 def test_which_reader(root, redis, monkeypatch):

@@ -161,6 +161,18 @@ def test_an_unavailable_store_is_reported_once(root):
     assert not follower.ended
 
 
+def test_a_long_run_comes_in_parts_and_ends_after_the_last(root, monkeypatch):
+    monkeypatch.setattr(stream, "MAX_RECORDS", 3)
+    append(root, "cube", record(4), record(5))
+    write_status(root, "cube", state="finished", iteration=5)
+    reader = DiskReader(root)
+    follower = RunFollower(reader, reader.run("cube"), None, 0)
+    heard = []
+    while not follower.ended:
+        heard.append([event.id or event.event for event in follower.poll()])
+    assert heard == [["1", "2", "3", "status"], ["4", "5"], ["end"]]
+
+
 def test_the_stream_ends_when_the_run_was_deleted(root, service):
     with listening(service[1]) as heard:
         take(heard, "metrics", "status")

@@ -355,6 +355,22 @@ def test_a_directory_that_cannot_be_read_is_a_damaged_run_beside_the_others(ende
         assert DiskReader(root).run(name) == runs[name]
 
 
+def test_a_run_that_cannot_be_read_is_not_asked_to_stop_and_a_root_is_no_damaged_run(told, tmp_path, monkeypatch):
+    reader = told(a_status())
+    assert reader.run("cube").state == "running"
+
+    def refuse(*_):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr(disk_reader, "read_regular", refuse)
+    assert reader.run("cube").state == "interrupted"
+    with pytest.raises(StoreUnavailableError, match="Permission denied"):
+        reader.request_stop("cube")
+    monkeypatch.setattr(disk_reader.os, "scandir", refuse)
+    with pytest.raises(StoreUnavailableError, match="cannot read the runs"):
+        reader.run("cube")
+
+
 def test_whatever_is_wrong_with_a_run_it_hides_no_other(ended, monkeypatch):
     """An error that was not thought of, say."""
     shutil.copytree(ended, ended.parent / "other")
@@ -380,6 +396,8 @@ def test_only_what_is_new_is_read(growing):
     assert len(records.columns(None).iteration) == 1999
     writer.append(a_record(2000))
     assert [each["iteration"] for each in records.after(100)] == list(range(101, 2001))
+    assert [each["iteration"] for each in records.after(100, most=3)] == [101, 102, 103]
+    assert [each["iteration"] for each in records.after(1998, most=1)] == [1999]
     before = bytes_read()
     assert records.after(1999) == [a_record(2000)]
     assert bytes_read() - before < path.stat().st_size // 2
