@@ -49,7 +49,8 @@ def load(
 
     Returns:
         ``.policy``, ``.act_deterministic`` and ``.begin`` act; ``.primitives`` or ``.skills``, where there are some,
-        compose or act by a vector; ``.config`` and ``.manifest``: what it was trained with; ``.kind``: what it is.
+        compose or act by a vector; ``.kind``: what it is; ``.config``: its world, networks and evaluation (of a
+        version other keys have their defaults: ``.manifest.config`` has all that it was trained with).
 
     Raises:
         TandemError: nothing there by that reference, damaged, or not finished; or what it acts with is not here; or the
@@ -61,11 +62,11 @@ def load(
 
 
 def train(
-    what: str | None = None,
+    what: Path | str | None = None,
     settings: Sequence[str] = (),
     *,
     method: str | None = None,
-    primitives: str | None = None,
+    primitives: Path | str | None = None,
     run_dir: Path | str | None = None,
     registry: Path | str | None = None,
     resume: bool = False,
@@ -79,7 +80,7 @@ def train(
             run has that goes on.
         settings: ``a.b=c`` overrides.
         method: of a task, or of skill discovery.
-        primitives: that the method of a task takes.
+        primitives: that the method of a task takes, a reference as ``load`` has it.
         run_dir: where it keeps everything; default: ``runs/NAME``.
         registry: where it publishes, and finds what it takes; by default TANDEM_REGISTRY or ``registry``.
         resume: go on with the run there.
@@ -93,6 +94,7 @@ def train(
     Raises:
         TandemError: a setting, a file or a directory that cannot be used.
     """
+    from service.base.errors import TandemError
     from service.config import load_config
     from service.config.recipes import DEFAULT_RECIPE, recipes
     from service.runs import train as training
@@ -100,7 +102,12 @@ def train(
     from service.runs.resuming import resumed_config
     from service.store.run_directory import RunDirectory
 
-    file, first = named(what, method, primitives)
+    for key, value in (("what", what), ("primitives", primitives)):
+        if not isinstance(value, Path | str | None):
+            raise TandemError(f"{key} is a {type(value).__name__}: a run records names and files, so give one of those")
+    settings = [settings] if isinstance(settings, str) else settings
+    said = (None if each is None else str(each) for each in (what, method, primitives))
+    file, first = named(*said, resumed=resume)
     overrides = [*first, *settings]
     begun = file if file is not None or first else recipes()[DEFAULT_RECIPE]
     registry = registry or _registry()

@@ -30,6 +30,7 @@ PRIVATE = "tandem_user_"
 """Begins the names of the modules that such texts make."""
 MAX_BYTES = 40_000
 """Of a file: it is in the configuration of a run, and in every checkpoint."""
+_ALONE = "a file stands alone: put what it needs into it, or install that"
 ALIKE = 0.8
 """Similarity of two names, by ``difflib``, of which one is likely the other one misspelt."""
 
@@ -128,10 +129,26 @@ def run(origin: str, text: str) -> ModuleType:
         # stdout has what was asked of a command, such as JSON
         with naming_errors_of(origin), contextlib.redirect_stdout(sys.stderr):
             exec(compile(text, origin, "exec", dont_inherit=True), vars(module))
+        _stands_alone(module, origin)
     except BaseException:  # a second try is none of the half that ran
         del sys.modules[name]
         raise
     return module
+
+
+def _stands_alone(module: ModuleType, origin: str) -> None:
+    """Refuse what a text has from a file beside its own: a run records neither, nor finds that elsewhere.
+
+    A module of an installed package may use others of it.
+    """
+    here = Path(origin).resolve().parent
+    if not origin.endswith(".py") or (here / "__init__.py").exists() or here.name.endswith("-packages"):
+        return
+    for value in list(vars(module).values()):
+        name = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", None)
+        file = getattr(sys.modules.get(name), "__file__", None) if isinstance(name, str) else None
+        if file is not None and name not in (module.__name__, "__main__") and Path(file).resolve().parent == here:
+            raise CodeError(f"{origin}: it has {name} from {file}; {_ALONE}")
 
 
 @contextmanager
@@ -147,8 +164,8 @@ def naming_errors_of(origin: str) -> Iterator[None]:
         if isinstance(error, SyntaxError) and error.filename == origin:  # and not of what it imports
             lines, said = [error.lineno], error.msg
         where = f"{origin}:{lines[-1]}" if lines else origin
-        if isinstance(error, ModuleNotFoundError):
-            said += "; a file stands alone: put what it needs into it, or install that"
+        if isinstance(error, ModuleNotFoundError) or (isinstance(error, ImportError) and "relative import" in said):
+            said += f"; {_ALONE}"
         raise CodeError(f"{where}: {type(error).__name__}{': ' * bool(said)}{said}") from error
 
 

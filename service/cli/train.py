@@ -202,21 +202,21 @@ def train(
         )  # fmt: skip
         return
     file, first = named(what, method, primitives)
-    overrides = [*first, *overrides]
     begun = file if file is not None or first else recipes()[DEFAULT_RECIPE]
-    run_dir = run_dir or runs / load_config(begun, overrides).directory_name
+    run_dir = run_dir or runs / load_config(begun, [*first, *overrides]).directory_name
     directory = RunDirectory(run_dir)
     if resume == AUTO:
         again = directory.exists
     start = None
     if again:
-        resolved = resumed_config(directory, overrides, file)
+        _, said = named(what, method, primitives, resumed=True)
+        resolved = resumed_config(directory, [*said, *overrides], file)
     else:
         with loading():
             from service.registry.loading import load
 
             start = load(start_from, source).expect("primitives", by="--from") if start_from is not None else None
-            resolved = load_config(begun, overrides).begin(source, start)
+            resolved = load_config(begun, [*first, *overrides]).begin(source, start)
     train_and_tell(
         resolved, directory, source, resume=again, publish=publish, start=start, trackers=trackers,
         cluster=cluster_options() if runtime == "ray" else None, address=address, typed=typed,

@@ -91,7 +91,8 @@ def explained(error: ValidationError, kind: type[BaseModel]) -> str:
         *groups, name = (part for part in first["loc"] if isinstance(part, str) and part not in NO_KEYS)
         prefix, keys = "".join(f"{group}." for group in groups), list(_keys(kind))
         known = sorted(name for before, name in keys if before == prefix)
-        more = f"; known there: {', '.join(known)}{more}{_elsewhere(keys, name, kind) or did_you_mean(name, known)}"
+        meant = _elsewhere(keys, groups, name, kind) or did_you_mean(name, known)
+        more = f"; known there: {', '.join(known)}{more}{meant}"
     return f"{first_error(error)}{more}"
 
 
@@ -137,9 +138,11 @@ def _keys(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str]]
             yield from _keys(group, f"{prefix}{name}.")
 
 
-def _elsewhere(keys: Sequence[tuple[str, str]], name: str, kind: type[BaseModel]) -> str:
-    """The end of a message about a key that is not in its group, where another group or method has it."""
-    found = sorted(prefix + name for prefix, other in keys if other == name)
+def _elsewhere(keys: Sequence[tuple[str, str]], groups: Sequence[str], name: str, kind: type[BaseModel]) -> str:
+    """The end of a message about a key that is not in its groups, where another group or method has it."""
+    above, own = "".join(f"{group}." for group in groups[:-1]), "".join(groups[-1:])
+    near = [above + other for prefix, other in keys if prefix == above and other in (f"{own}_{name}", name)]
+    found = near or sorted(prefix + name for prefix, other in keys if other == name)
     if found:
         return f"; did you mean {' or '.join(found)}?"
     if not issubclass(kind, Config):

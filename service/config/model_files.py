@@ -21,6 +21,8 @@ PACKAGE = "package:"
 """Begins the name of a file in a Python package."""
 LEAST_M, MOST_M = 0.005, 0.5
 """Extents that an object may have."""
+_WELD = 1e-5
+"""Of the extent of a mesh: vertices so near to one another are at one place."""
 _USUAL_M = 0.05
 """Extent of an object that is neither large nor small."""
 LEAST_CONVEX = 0.95
@@ -135,11 +137,12 @@ def _read_piece(name: str, scale: float) -> tuple[StateArray, float]:
         try:
             model = spec.compile()
         except ValueError as error:
-            raise ConfigError(
-                f"mesh {name}: MuJoCo cannot use it: {' '.join(str(error).split())}; give an STL or OBJ file"
-            ) from None
+            said = " ".join(str(error).split())
+            hints = (advice for words, advice in _ADVICE.items() if words in said)
+            advice = next(hints, "give an STL or OBJ file")
+            raise ConfigError(f"mesh {name}: MuJoCo cannot use it: {said}; {advice}") from None
         volumes.append(float(model.body("piece").mass[0]) / 1000.0)
-    _check_closed(name, model.mesh_face)
+    _check_closed(name, model.mesh_vert, model.mesh_face)
     exact, convex = volumes
     if exact < LEAST_CONVEX * convex:
         raise ConfigError(
@@ -152,12 +155,23 @@ def _read_piece(name: str, scale: float) -> tuple[StateArray, float]:
     return vertices, exact
 
 
-def _check_closed(name: str, faces: Any) -> None:
-    """Check that every edge has a triangle on either side."""
+_ADVICE = {
+    "misoriented": "turn its faces outwards, for example in Blender (Mesh, Normals, Recalculate Outside)",
+    "ASCII": "save it as binary STL, or as OBJ",
+}
+"""What to do by words of MuJoCo's errors."""
+
+
+def _check_closed(name: str, vertices: Any, faces: Any) -> None:
+    """Check that every edge has a triangle on either side; vertices at one place are one, as where textures meet."""
+    places = np.round((vertices - vertices.min(axis=0)) / (_WELD * np.ptp(vertices, axis=0).max()))
+    _, same = np.unique(places, axis=0, return_inverse=True)
+    faces = same.ravel()[faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     _, counts = np.unique(edges, axis=0, return_counts=True)
     if (num := int((counts != 2).sum())) > 0:
         raise ConfigError(
             f"mesh {name} is not closed: {num} of its {len(counts)} edges have not two triangles; repair it, for "
-            "example in Blender (Mesh, Clean Up, Fill Holes)"
+            "example in Blender (Mesh, Clean Up, Merge by Distance and Fill Holes)"
         )

@@ -93,7 +93,7 @@ class WorldBatch:
         self.blocked_fraction = blocked_fraction
         """Share of later starts with a blocked gripper; more than 0 only where it was when the batch was made."""
         self._control_spec = _CONTROL_AND_BOX if self.model.nmocap else int(mujoco.mjtState.mjSTATE_CTRL)
-        self.reach.check(config.workspace, robot.name)
+        self.reach.check(config.workspace, robot.name, self.robot.arm)
         self._widest_m = self.robot.opening_m if config.gripper == "free" else 0.0
         self._fresh_state = self._make_fresh_state()
         self.states: StateArray = np.tile(self._fresh_state, (num_worlds, 1))

@@ -53,16 +53,25 @@ class Reach:
         clipped[:, :2] = self.axis + away * (np.clip(distance, nearest, furthest) / distance)[:, None]
         return clipped
 
-    def check(self, workspace: WorkspaceConfig, name: str) -> None:
-        """Assert that nearly all of a workspace, from the least commanded height on, is within reach of a robot.
+    def check(self, workspace: WorkspaceConfig, name: str, arm: Chain) -> None:
+        """Check that nearly all of a workspace, from the least commanded height on, is within reach of a robot.
 
         Raises:
             ConfigError: it is not.
         """
         lower, upper = np.array(workspace.lower_m), np.array(workspace.upper_m)
         lower[2] = self.height[0]
-        sides = [np.linspace(low, high, 15) for low, high in zip(lower, upper, strict=True)]
+        is_any_shape = bool(np.isinf(self.furthest).any())  # then the arm is sent there
+        sides = [np.linspace(low, high, 7 if is_any_shape else 15) for low, high in zip(lower, upper, strict=True)]
         points = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 3)
+        if is_any_shape:
+            joints = arm.solve(np.tile(arm.home, (len(points), 1)), points, num_iterations=50)
+            if (share := float(_arrives(arm, joints, points).mean())) < _LEAST_SHARE:
+                raise ConfigError(
+                    f"robot {name}: {1.0 - share:.0%} of the workspace is out of its reach: make world.workspace "
+                    "smaller, or change the robot's base_position_m or the ranges of its joints"
+                )
+            return
         share = float((np.linalg.norm(self.clip(points) - points, axis=1) < 1e-9).mean())
         if share < _LEAST_SHARE:
             x, y = self.axis
@@ -91,6 +100,9 @@ def reach_of(robot: RobotConfig, arm: Chain) -> Reach:
 def _find(robot: RobotConfig, arm: Chain) -> Reach:
     home = arm.forward(arm.home[None]).position[0]
     if arm.base_axis is None:  # its reach has another shape; its joints' limits are all that holds it back
+        there = arm.solve(arm.home[None], home[None], num_iterations=50)
+        if not _arrives(arm, there, home[None])[0]:
+            raise _not_at_home(robot, arm, home)
         any_height = np.array([robot.lowest_m, robot.lowest_m + 10.0])
         return Reach(home[:2], any_height, np.zeros(2), np.full(2, np.inf))
     axis: StateArray = arm.base_axis
@@ -110,16 +122,7 @@ def _find(robot: RobotConfig, arm: Chain) -> Reach:
     joints = arm.solve(np.tile(arm.home, (_NUM_HEIGHTS, 1)), above_home, num_iterations=50)
     first, last = _run(_arrives(arm, joints, above_home), int(np.argmin(np.abs(heights - home[2]))))
     if first == last:
-        for name, value, low, high in zip(robot.joints, arm.home, arm.lower, arm.upper, strict=True):
-            if not low <= value <= high:
-                raise ConfigError(
-                    f"robot {robot.name}: home of {name!r} is {value:g}, and the joint goes from {low:.2f} to "
-                    f"{high:.2f}: give rad, or metres of one that slides"
-                )
-        raise ConfigError(
-            f"robot {robot.name}: from its home posture the arm does not come to ({in_metres(home)}) m with the "
-            f"orientation {robot.orientation!r}: check home, effector and orientation"
-        )
+        raise _not_at_home(robot, arm, home)
     heights, joints = heights[first:last], joints[first:last]
     ends = []
     for step_m in (-_STEP_M, _STEP_M):
@@ -134,6 +137,20 @@ def _find(robot: RobotConfig, arm: Chain) -> Reach:
         ends.append(end - np.sign(step_m) * _MARGIN_M)
     first, last = _run(ends[0] < ends[1], int(np.argmin(np.abs(heights - home[2]))))
     return Reach(axis, heights[first:last], ends[0][first:last], ends[1][first:last])
+
+
+def _not_at_home(robot: RobotConfig, arm: Chain, home: StateArray) -> ConfigError:
+    """Why an arm does not come to where it is at home."""
+    for name, value, low, high in zip(robot.joints, arm.home, arm.lower, arm.upper, strict=True):
+        if not low <= value <= high:
+            return ConfigError(
+                f"robot {robot.name}: home of {name!r} is {value:g}, and the joint goes from {low:.2f} to "
+                f"{high:.2f}: give rad, or metres of one that slides"
+            )
+    return ConfigError(
+        f"robot {robot.name}: from its home posture the arm does not come to ({in_metres(home)}) m with the "
+        f"orientation {robot.orientation!r}: check home, effector and orientation"
+    )
 
 
 def _arrives(arm: Chain, joints: StateArray, targets: StateArray) -> BoolArray:

@@ -30,6 +30,7 @@ from service.envs.observations import (
 from service.envs.reach import Reach
 from service.envs.robot import described
 from service.envs.scene import FIXTURE_PREFIX
+from service.envs.state_layout import OBSTACLE_PREFIX
 from service.export.measurements import Measured, tolerated_late_steps
 from service.export.networks import Network
 from service.registry.loading import Trained
@@ -143,7 +144,8 @@ def describe(
             for each in world.obstacles
         ],
         "fixtures": fixtures,  # that are the same in every episode; the box of the task box is elsewhere in each
-        "success_distance_m": trained.success_distance_m,
+        # None: a function of the task says what counts
+        "success_distance_m": trained.success_distance_m if trained.task is None or not trained.task.success else None,
         "measured": measured,
         "tolerated_late_steps": tolerated_late_steps(measured),
     }
@@ -326,6 +328,7 @@ Objects and goals are in {box} m; in {measured[motion][outside_workspace]:.1%} o
 {things}. Episodes start with the tip at {home_m} m and the gripper open by {home_mm:.0f} mm.
 """
 _TASK = "\nThe task: {}.\n"
+_OBSTACLES = "\nThese start on the table, elsewhere in every episode{}:\n\n{}\n"
 _FIXTURES = "\nThese stand on the table, here by the upright boxes around them; it does not see them:\n\n{}\n"
 
 
@@ -408,6 +411,12 @@ def make_readme(about: Description, start: FloatArray) -> str:
     )
     if about["task"] is not None:
         text += _TASK.format(about["task"])
+    if about["obstacles"]:
+        seen = any(field["name"].startswith(OBSTACLE_PREFIX) for field in about["observation"])
+        things = ((one["shape"], _size(one), f"{one['mass_kg']:g}") for one in about["obstacles"])
+        text += _OBSTACLES.format(
+            "" if seen else "; it does not see them", table(("obstacle", "size, mm", "mass, kg"), things)
+        )
     if about["fixtures"]:
         rows = ((one["name"], *_ranges(one)) for one in about["fixtures"])
         text += _FIXTURES.format(table(("fixture", "x, m", "y, m", "z, m"), rows))
@@ -432,11 +441,16 @@ def _things(objects: Sequence[Mapping[str, Any]]) -> str:
     """What each object is, in words."""
     words = []
     for number, one in enumerate(objects, 1):
-        size = " x ".join(f"{1e3 * each:g}" for each in one["extent_m"])
+        size = _size(one)
         shape = f"{'an' if one['shape'] == 'ellipsoid' else 'a'} {one['shape']}"
         words.append(f"{_which(number, len(objects))} is {shape} of {size} mm and {one['mass_kg']:g} kg")
     said = ", ".join(words)
     return said[0].upper() + said[1:]
+
+
+def _size(thing: Mapping[str, Any]) -> str:
+    """Of an object or an obstacle, mm."""
+    return " x ".join(f"{1e3 * each:g}" for each in thing["extent_m"])
 
 
 def _pressing(gripper: Mapping[str, Any]) -> str:

@@ -24,8 +24,12 @@ def is_task(what: str) -> bool:
     return what in TASKS or parse_reference(what) is not None
 
 
-def named(what: str | None, method: str | None, primitives: str | None) -> tuple[Path | None, list[str]]:
+def named(
+    what: str | None, method: str | None, primitives: str | None, *, resumed: bool = False
+) -> tuple[Path | None, list[str]]:
     """The file of a recipe or configuration, if any, and the overrides that a task or method stands for.
+
+    Of a run that is ``resumed`` only what was said: it has its method.
 
     Raises:
         TandemError: no such recipe, task or file; or options that mean nothing there.
@@ -37,7 +41,8 @@ def named(what: str | None, method: str | None, primitives: str | None) -> tuple
             raise TandemError(f"--method {method}: of a task choose one of {', '.join(TASK_METHODS)}{meant}")
         if method in TASK_METHODS and method not in METHODS:
             raise TandemError(f"{method} learns nothing: measure it by tandem evaluate --task {what} --method {method}")
-        chosen = {"task": what, "method": method or "ours"} | ({} if primitives is None else {"primitives": primitives})
+        said = {"method": method or (None if resumed else "ours"), "primitives": primitives}
+        chosen = {"task": what} | {key: word for key, word in said.items() if word is not None}
         # as JSON, which is YAML: a name may look like a number or a date
         return None, [f"{key}={json.dumps(word, ensure_ascii=False)}" for key, word in chosen.items()]
     if primitives is not None:

@@ -63,6 +63,7 @@ def test_one_of_a_kind_needs_no_name():
         ("A = 1\nB = 1 / 0", None, "numbers.py:2: ZeroDivisionError: division by zero"),
         ("A = 1\nB = (", None, "numbers.py:2: SyntaxError: "),
         ("import gone_for_ever", None, "numbers.py:1: ModuleNotFoundError: "),
+        ("from . import helper", None, "import with no known parent package; a file stands alone"),
         ("raise KeyError", None, "numbers.py:1: KeyError"),
         ("A = 1\n\neval('(')", None, "numbers.py:3: SyntaxError: "),
     ],
@@ -71,6 +72,18 @@ def test_what_is_wrong_is_said_with_its_line(text, name, said):
     with pytest.raises(CodeError) as error:
         found_in(text, name)
     assert_one_line(error.value, said)
+
+
+@pytest.mark.parametrize("text", ["import beside_it\nA = 3", "from beside_it import twice\nA = 3"])
+def test_a_file_beside_it_is_refused_though_it_can_be_imported(tmp_path, monkeypatch, text):
+    (tmp_path / "beside_it.py").write_text("def twice(x): return 2 * x\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "beside_it", raising=False)
+    origin = str(tmp_path / "mine.py")
+    with pytest.raises(CodeError) as error:
+        run(origin, text)
+    assert_one_line(error.value, origin, "it has beside_it from", "a file stands alone")
+    assert run(str(tmp_path / "elsewhere" / "mine.py"), text)  # as of what is installed
 
 
 def test_a_text_runs_once_under_a_name_of_its_own():

@@ -62,7 +62,8 @@ def test_resume_auto_begins_a_run_and_goes_on_with_it(tmp_path, monkeypatch):
     assert rows == [200, 400, 600]
     config, result = RunDirectory(path).read_config(), RunDirectory(path).read_result()
     assert (config.primitives, config.task_version, result["env_steps"]) == (CHAMPION, 1, 600)
-    more = tandem("train", "--resume", "--run-dir", path, "--set", "run.total_env_steps=800")
+    # its method is that of the run, though another one would be the task's first
+    more = tandem("train", "wall", "--resume", "--run-dir", path, "--set", "run.total_env_steps=800")
     assert "finished after 800 env steps" in more.stdout
     assert "nothing was left" not in more.stdout
     again = tandem("train", "--resume", "--run-dir", path)

@@ -118,6 +118,8 @@ def test_overrides_beat_the_file_and_the_last_one_wins(tmp_path):
         ("world.workspace.width_m=1", ["unknown key 'world.workspace.width_m'", "length_x_m, length_y_m"]),
         ("world.object={shape: sphere, size_m: [0.05], w: 1}", ["'world.object.w'; known there: color, mesh, shape"]),
         ("world.obstacles=[{shape: sphere, size_m: [0.05], w: 1}]", ["'world.obstacles.0.w'; known there: color"]),
+        ("world.object.mass_kg=1", ["did you mean world.object_mass_kg?"]),
+        ("world.object.friction=1", ["did you mean world.friction?"]),
         ("game.num_worlds=0", ["game.num_worlds = 0"]),
         ("world.object=teapot", ["world.object = ", "teapot"]),
         ("seed=0.5", ["seed = 0.5"]),

@@ -49,6 +49,16 @@ def write_ramp(path):
     return path
 
 
+def write_split(path, *, flip=False):
+    """An OBJ file of a box whose triangles have vertices of their own, as where textures meet."""
+    triangles = [triple for a, b, c, d in QUADS for triple in ((a, b, c), (a, c, d))]
+    places = [CORNERS[index] * (0.06, 0.04, 0.03) for triple in triangles for index in triple[:: -1 if flip else 1]]
+    lines = [f"v {x} {y} {z}" for x, y, z in places]
+    lines += [f"f {3 * n + 1} {3 * n + 2} {3 * n + 3}" for n in range(len(triangles))]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
 def world_with(*pieces, scale=None, overrides=()):
     names = ", ".join(str(piece) for piece in pieces)
     extra = f", scale: {scale}" if scale is not None else ""
@@ -128,6 +138,12 @@ def test_it_is_picked_up_carried_and_held(tmp_path):
     assert held.mean() >= 0.9
 
 
+def test_vertices_at_one_place_are_one(tmp_path):
+    split, box = (world_with(each) for each in (write_split(tmp_path / "split.obj"), write_box(tmp_path / "box.obj")))
+    assert split.world.object.size_m == box.world.object.size_m
+    assert split.world.object.mesh.volume_m3 == pytest.approx(box.world.object.mesh.volume_m3)
+
+
 def test_it_is_read_once(tmp_path, monkeypatch):
     file = write_box(tmp_path / "box.obj")
     monkeypatch.chdir(tmp_path)
@@ -153,6 +169,9 @@ def test_mistakes_are_one_line(tmp_path):
         with pytest.raises(ConfigError) as error:
             world_with(*pieces)
         assert_one_line(error.value, *said)
+    with pytest.raises(ConfigError) as error:
+        world_with(write_split(tmp_path / "inside_out.obj", flip=True))
+    assert_one_line(error.value, "inside_out.obj", "MuJoCo cannot use it", "turn its faces outwards")
     (tmp_path / "text.stl").write_text("no mesh")
     with pytest.raises(ConfigError) as error:
         world_with(tmp_path / "text.stl")

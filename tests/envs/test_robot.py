@@ -231,6 +231,22 @@ def test_mistakes_in_a_description_are_one_line(tmp_path, changed, said):
     assert_one_line(error.value, "pincher", *said)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('range="-.5 .3"', 'range="-.1 .3"', ["57% of the workspace is out of its reach", "base_position_m"]),
+        ('axis="1 0 0" range="-.5 .5"', 'axis="1 0 0" range="-.06 .06"', ["of the workspace is out of its reach"]),
+        ('range="-.5 .3"', 'range="-.5 -.1"', ["home of 'z' is 0", "the joint goes from"]),
+    ],
+)
+def test_a_gantry_has_to_reach_the_workspace_from_home(tmp_path, old, new, said):
+    assert old in GANTRY
+    robot = write_robot(tmp_path, GANTRY.replace(old, new), GANTRY_DESCRIPTION)
+    with pytest.raises(ConfigError) as error:
+        WorldBatch(world_of(robot), 1)
+    assert_one_line(error.value, "gantry", *said)
+
+
 TURNS, ROLLS_FREELY = '<joint name="roll" axis="0 0 1" range="-3 3"/>', '<joint name="roll" type="ball"/>'
 
 
