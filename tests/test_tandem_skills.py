@@ -88,3 +88,12 @@ def test_training_is_what_the_command_does(tmp_path, monkeypatch):
     assert (done.reason, done.iteration, seen) == ("finished", 2, [1.0, 2.0])
     loaded = tandem_skills.load(str(tmp_path / "run"))
     assert loaded.kind == "primitives"
+
+
+def test_what_train_does_not_take_is_said():
+    for arguments, said in (
+        ({"what": tandem_skills.find_task("push")}, "what is a Task"),
+        ({"what": "push", "primitives": tandem_skills.load()}, "primitives is a Trained"),
+    ):
+        with pytest.raises(TandemError, match=said):
+            tandem_skills.train(**arguments)

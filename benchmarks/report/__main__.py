@@ -196,11 +196,11 @@ class Report:
         return list(read_all(self._results / RESULTS.name / f"downstream_{name}").values())
 
     def skills_blocks(self, runs: Sequence[Run], todays: Sequence[Run]) -> Blocks:
-        """Parts of the blocks about skills: those of version 1 of what learns, and today's, which are not whole."""
+        """Parts of the blocks about skills: those of version 1 of what learns, and today's."""
         stages = self.show("Random skills at three stages of training", "skills", figures.draw_skills, runs)
         learned = [run for run in runs if run["method"] != "ours"]
         curves = self.show("Skill discovery over env steps", "skills-curves", figures.draw_skill_curves, learned)
-        again = self.show("The same, made anew", "skills-curves-today", figures.draw_skill_curves, todays)
+        again = self.show("Skill discovery over env steps", "skills-curves-today", figures.draw_skill_curves, todays)
         return {
             "today": [skills.coverage_table(todays), skills.episodes_table(todays), again],
             "coverage": [skills.coverage_table(runs), stages],

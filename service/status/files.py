@@ -13,6 +13,7 @@ from fastapi import Request
 from starlette.responses import FileResponse, Response
 from starlette.staticfiles import NotModifiedResponse, StaticFiles
 
+from service.base.files import open_regular
 from service.status.problems import ProblemError, problems
 from service.status.schemas import RunFile
 from service.store.disk_reader import run_directories
@@ -126,7 +127,7 @@ def file_response(
     """
     headers = {"cache-control": cache, **({"etag": f'"{etag}"'} if etag else {})}
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             status = os.fstat(file.fileno())
     except OSError as error:
         raise ProblemError(404, "no-such-file", f"{path.name} cannot be read: {error.strerror}") from None

@@ -33,7 +33,7 @@ def path(tmp_path_factory):
     file = write_yaml(root / "two.yaml", TREE | {"world": WORLD})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("service.runs.train.make_artifacts", lambda *arguments: {})  # a video takes long
-        service.train(str(file), SHORT, run_dir=root / "run", registry=root / "registry", publish=True)
+        service.train(file, SHORT, run_dir=root / "run", registry=root / "registry", publish=True)
     return root
 
 

@@ -3,11 +3,11 @@
 import errno
 import hashlib
 import os
-from pathlib import Path
 
 import pytest
 
 from service.registry.registry import Registry
+from service.status import files
 from service.status.files import RunDirectories
 from tests.status.runs import VIDEO
 
@@ -63,7 +63,7 @@ def test_a_file_that_may_not_be_read(client, monkeypatch):
     def refused(path, *_, **__):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
-    monkeypatch.setattr(Path, "open", refused)  # root may read everything
+    monkeypatch.setattr(files, "open_regular", refused)  # root may read everything
     answer = client.get(URL)
     assert (answer.status_code, answer.json()["type"]) == (404, "urn:tandem:no-such-file")
     assert "Permission denied" in answer.json()["detail"]
