@@ -1,6 +1,6 @@
 """How far the object goes in the representation of skills, phi, by a step sideways and by one upward.
 
-    python -m benchmarks.steps_in_phi --registry docs/results/v2/primitives --json docs/results/v2/steps_in_phi.json
+    python -m benchmarks.steps_in_phi --registry docs/results/v2/primitives --json docs/results/steps_in_phi.json
 
 LSD, METRA and CSF pay the way in phi along a skill, so this says what they pay for at most: all versions of them in a
 registry, at random places of the object on the table, and above it.

@@ -106,15 +106,16 @@ def train(
         if not isinstance(value, Path | str | None):
             raise TandemError(f"{key} is a {type(value).__name__}: a run records names and files, so give one of those")
     settings = [settings] if isinstance(settings, str) else settings
-    said = (None if each is None else str(each) for each in (what, method, primitives))
-    file, first = named(*said, resumed=resume)
+    target, takes = (None if each is None else str(each) for each in (what, primitives))
+    file, first = named(target, method, takes)
     overrides = [*first, *settings]
     begun = file if file is not None or first else recipes()[DEFAULT_RECIPE]
     registry = registry or _registry()
     path = Path(run_dir) if run_dir is not None else Path("runs") / load_config(begun, overrides).directory_name
     directory = RunDirectory(path)
     if resume:
-        config = resumed_config(directory, overrides, file)
+        _, said = named(target, method, takes, resumed=True)
+        config = resumed_config(directory, [*said, *settings], file)
     else:
         config = load_config(begun, overrides).begin(registry, None)
     told = on_iteration or (lambda metrics: None)

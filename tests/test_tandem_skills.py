@@ -97,3 +97,9 @@ def test_what_train_does_not_take_is_said():
     ):
         with pytest.raises(TandemError, match=said):
             tandem_skills.train(**arguments)
+
+
+def test_a_task_that_never_began_cannot_be_resumed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(TandemError, match="runs/push-ours-0"):
+        tandem_skills.train("push", resume=True)

@@ -129,7 +129,7 @@ def run(origin: str, text: str) -> ModuleType:
         # stdout has what was asked of a command, such as JSON
         with naming_errors_of(origin), contextlib.redirect_stdout(sys.stderr):
             exec(compile(text, origin, "exec", dont_inherit=True), vars(module))
-        _stands_alone(module, origin)
+            _stands_alone(module, origin)
     except BaseException:  # a second try is none of the half that ran
         del sys.modules[name]
         raise
@@ -137,9 +137,9 @@ def run(origin: str, text: str) -> ModuleType:
 
 
 def _stands_alone(module: ModuleType, origin: str) -> None:
-    """Refuse what a text has from a file beside its own: a run records neither, nor finds that elsewhere.
+    """Refuse a module, function or class that a text has from a file beside its own, which a run does not record.
 
-    A module of an installed package may use others of it.
+    A module of an installed package may use others of it. What is imported within a function is not seen.
     """
     here = Path(origin).resolve().parent
     if not origin.endswith(".py") or (here / "__init__.py").exists() or here.name.endswith("-packages"):

@@ -170,7 +170,7 @@ def _check_closed(name: str, vertices: Any, faces: Any) -> None:
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     _, counts = np.unique(edges, axis=0, return_counts=True)
-    if (num := int((counts != 2).sum())) > 0:
+    if (num := int((counts % 2 != 0).sum())) > 0:  # four where two closed parts touch
         raise ConfigError(
             f"mesh {name} is not closed: {num} of its {len(counts)} edges have not two triangles; repair it, for "
             "example in Blender (Mesh, Clean Up, Merge by Distance and Fill Holes)"

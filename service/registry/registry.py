@@ -17,6 +17,7 @@ import hashlib
 import os
 from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ import numpy as np
 from service.base import tensors
 from service.base.errors import DamagedBlobError, RegistryError, StorageError, UnknownVersionError, did_you_mean
 from service.base.files import open_to_append, os_errors, read_regular, write_atomic, write_exclusive
-from service.base.lock import LOCK_FILE, take
+from service.base.lock import LOCK_FILE, WITHOUT_LOCKS, take
 from service.base.version import git_commit
 from service.registry import names
 from service.registry.manifest import Manifest, make_manifest, read_manifest
@@ -354,10 +355,20 @@ class Registry:
         with os_errors("write", path):
             directory.mkdir(parents=True, exist_ok=True)
             with open_to_append(directory / LOCK_FILE) as lock:
-                if not take(lock, directory / LOCK_FILE, _WAIT_S):
-                    raise StorageError(f"another process holds {directory / LOCK_FILE}; end it, or try again")
+                self._wait_for(lock, directory / LOCK_FILE)
                 if back or (self._read_alias(name, alias) or 0) < number:
                     write_atomic(path, f"{number}\n".encode())
+
+    def _wait_for(self, lock: FileIO, path: Path) -> None:
+        try:
+            taken = take(lock, path, _WAIT_S)
+        except OSError as error:
+            raise StorageError(
+                f"{path}: its file system has no locks ({error.strerror}); use another registry, or see to it that one "
+                f"process at a time publishes and set {WITHOUT_LOCKS}=1"
+            ) from None
+        if not taken:
+            raise StorageError(f"another process has held {path} for {_WAIT_S:g} s; end it, or try again")
 
     def _problems_of(self, version: Version, check: Check) -> list[str]:
         try:

@@ -37,6 +37,10 @@ def resumed_config(directory: RunDirectory | Path, overrides: list[str], file: P
             apply_override(tree, override)
         if (method := tree.get("method", saved.method)) != saved.method:  # whose keys are others
             raise ConfigError(f"the run learns by {saved.method}, not by {method}: name that, or another run") from None
+        if "task" in tree and "task" not in type(saved).model_fields:
+            raise ConfigError(
+                f"the run learns by {saved.method}, not the task {tree['task']}: leave that out, or name another run"
+            ) from None
         raise
     if type(given) is type(saved):
         given = given.as_in(saved)

@@ -127,7 +127,7 @@ def file_response(
     """
     headers = {"cache-control": cache, **({"etag": f'"{etag}"'} if etag else {})}
     try:
-        with open_regular(path) as file:
+        with open_regular(path, follow=True) as file:
             status = os.fstat(file.fileno())
     except OSError as error:
         raise ProblemError(404, "no-such-file", f"{path.name} cannot be read: {error.strerror}") from None

@@ -26,7 +26,7 @@ from typing import TypeVar
 
 from typing_extensions import override
 
-from service.base.errors import DamagedStoreError, StoreUnavailableError, UnknownRunError
+from service.base.errors import DamagedStoreError, StoreError, StoreUnavailableError, UnknownRunError
 from service.store.address import RedisAddress, address_from_environment
 from service.store.disk_reader import DiskReader
 from service.store.models import ACTIVE, Columns, GoalGrid, Record, RunReader, RunStatus
@@ -112,13 +112,17 @@ class CombinedReader(RunReader):
     def request_stop(self, run_id: str) -> None:
         shown = self.run(run_id)  # or raise UnknownRunError
         in_redis = self._ask_redis(lambda: self._redis.run(run_id))
-        if in_redis is not None and not _are_two(shown, in_redis):
+        if is_asked := in_redis is not None and not _are_two(shown, in_redis):
             self._ask_redis(lambda: self._redis.request_stop(run_id))
+            is_asked = self._failure is None
         try:
             self._disk.request_stop(run_id)
         except UnknownRunError:  # of a run on another machine
             if self._failure is not None:
                 raise self._away() from None
+        except StoreError:
+            if not is_asked:
+                raise
 
     @override
     def ready(self) -> None:

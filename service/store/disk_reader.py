@@ -176,7 +176,11 @@ class DiskReader(RunReader):
     @override
     def request_stop(self, run_id: str) -> None:
         with self._using(run_id) as path:
-            if self._read_status(run_id, path).state in ACTIVE:
+            try:
+                is_active = self._read_status(run_id, path).state in ACTIVE
+            except ParseError as error:
+                raise DamagedStoreError(f"{path} has a damaged {STATUS_FILE}, so nobody is asked: {error}") from None
+            if is_active:
                 (path / STOP_FILE).touch()
 
     @override
