@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measuring import machine, one_line_errors, write_json
+from service.base.types import FloatArray, StateArray
 from service.config.skills import SkillDiscoveryConfig
 from service.config.world import WorkspaceConfig
 from service.policies.forward import relu_layers
@@ -33,14 +34,15 @@ def steps_in_phi(skills: FrozenSkills, workspace: WorkspaceConfig, num: int = 2_
     rng = np.random.default_rng(0)
     places = rng.uniform(workspace.lower_m, workspace.upper_m, (num, 3))
 
-    def at(height_m: float) -> Any:
+    def at(height_m: float) -> StateArray:
         return np.column_stack((places[:, :2], np.full(num, height_m)))
 
-    def mean_way(begin: Any, end: Any) -> float:
-        way = relu_layers(np, skills.network, normalised_place(end)) - relu_layers(
-            np, skills.network, normalised_place(begin)
-        )
-        return float(np.linalg.norm(way, axis=1).mean())
+    def phi(place: StateArray) -> FloatArray:
+        found: FloatArray = relu_layers(np, skills.network, normalised_place(place.astype(np.float32)))
+        return found
+
+    def mean_way(begin: StateArray, end: StateArray) -> float:
+        return float(np.linalg.norm(phi(end) - phi(begin), axis=1).mean())
 
     table = at(HEIGHTS_M[0])
     sideways = [mean_way(table, table + step) for step in ((STEP_M, 0.0, 0.0), (0.0, STEP_M, 0.0))]

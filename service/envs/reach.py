@@ -66,20 +66,18 @@ class Reach:
         points = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 3)
         if is_any_shape:
             joints = arm.solve(np.tile(arm.home, (len(points), 1)), points, num_iterations=50)
-            if (share := float(_arrives(arm, joints, points).mean())) < _LEAST_SHARE:
-                raise ConfigError(
-                    f"robot {name}: {1.0 - share:.0%} of the workspace is out of its reach: make world.workspace "
-                    "smaller, or change the robot's base_position_m or the ranges of its joints"
-                )
-            return
-        share = float((np.linalg.norm(self.clip(points) - points, axis=1) < 1e-9).mean())
-        if share < _LEAST_SHARE:
+            within, where = _arrives(arm, joints, points), ""
+        else:
+            within = np.linalg.norm(self.clip(points) - points, axis=1) < 1e-9
             x, y = self.axis
+            where = (
+                f", which is {self.nearest.min():.2f} to {self.furthest.max():.2f} m from x = {x:.2f}, y = {y:.2f} "
+                f"where it is widest, and up to {self.height[-1]:.2f} m high"
+            )
+        if (share := float(within.mean())) < _LEAST_SHARE:
             raise ConfigError(
-                f"robot {name}: {1.0 - share:.0%} of the workspace is out of its reach, which is "
-                f"{self.nearest.min():.2f} to {self.furthest.max():.2f} m from x = {x:.2f}, y = {y:.2f} where it is "
-                f"widest, and up to {self.height[-1]:.2f} m high: make world.workspace smaller, or move the robot's "
-                "base_position_m"
+                f"robot {name}: {1.0 - share:.0%} of the workspace is out of its reach{where}: make world.workspace "
+                "smaller, or change the robot's base_position_m or the ranges of its joints"
             )
 
 

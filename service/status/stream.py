@@ -21,7 +21,7 @@ from service.store.models import ACTIVE, RunReader, RunStatus
 POLL_S = 0.5
 MAX_STREAMS = 64
 MAX_RECORDS = 1_000
-"""Read at once, some 6 MB: a client that comes back after a night has the others by and by."""
+"""Read in one poll, some 6 MB: a client that comes back after a night gets the others by later polls."""
 MAX_AGE_S = 3600.0
 """Streams end after this time and browsers reconnect, so a client that silently disappeared is not served for ever."""
 _RETRY_MS = 2000

@@ -179,7 +179,9 @@ class DiskReader(RunReader):
             try:
                 is_active = self._read_status(run_id, path).state in ACTIVE
             except ParseError as error:
-                raise DamagedStoreError(f"{path} has a damaged {STATUS_FILE}, so nobody is asked: {error}") from None
+                raise DamagedStoreError(
+                    f"{path}: the run was not asked to stop, its status is damaged: {error}"
+                ) from None
             if is_active:
                 (path / STOP_FILE).touch()
 

@@ -253,7 +253,7 @@ class RunReader(ABC):
     def metrics(self, run_id: str, *, after_iteration: int = 0, most: int | None = None) -> list[Record]:
         """The records of iterations above ``after_iteration``, in order, each iteration once (a resumed run's last).
 
-        With ``most`` only the first so many.
+        At most ``most`` of them, the first ones.
         """
 
     @abstractmethod

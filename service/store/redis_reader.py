@@ -124,7 +124,7 @@ class RedisReader(RunReader):
             self._client.ping()
 
     def _lines(self, run_id: str, first: str, most: int | None = None) -> list[bytes]:
-        """Texts of records whose iteration is at least ``first``; above it with a bracket. Of ``most`` the first."""
+        """Texts of records whose iteration is at least ``first``; above it with a bracket. At most ``most``."""
         part = {} if most is None else {"start": 0, "num": most}
         with self._address.errors():
             lines: list[bytes] = self._client.zrangebyscore(run_key(run_id, "metrics"), first, "+inf", **part)

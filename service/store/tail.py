@@ -97,7 +97,7 @@ class RecordFile:
             """Lines that are no records, of those in columns."""
 
     def after(self, iteration: int, most: int | None = None) -> list[Record]:
-        """The records of iterations above ``iteration``, in order; with ``most`` only the first so many."""
+        """The records of iterations above ``iteration``, in order; at most ``most``, the first ones."""
         with self._open() as file:
             kept = _newest(file)
             if not kept or _iteration(kept[0]) > iteration:
@@ -189,7 +189,7 @@ def _newest(file: BinaryIO) -> list[Record]:
 
 
 def _read_from(file: BinaryIO, start: int, after: int = -1, most: int | None = None) -> list[Record]:
-    """The records behind a place in a file, each iteration once: those above ``after``, the first ``most``."""
+    """The records behind a place in a file, each iteration once: those above ``after``, at most ``most``."""
     file.seek(start)
     if start:
         file.readline(_MAX_LINE_BYTES)  # the rest of a line
