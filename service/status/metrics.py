@@ -69,12 +69,13 @@ def _age_s(when: datetime) -> float:
 def _actor_age_s(run: RunStatus) -> float | None:
     """Of those that have started: others may wait for a core for as long as the run goes on.
 
-    By the clock of the run's machine alone, which both heartbeats are of: it may differ from the one here.
+    By the run's machine, whose clock may differ from the one here. Compared with each other: while the run measures
+    at its end, it asks none of them.
     """
     if run.state not in ACTIVE:
         return None
     beats = [actor.heartbeat for actor in run.actors if actor.state == "alive"]
-    return (run.heartbeat - min(beats)).total_seconds() if beats else None
+    return (max(beats) - min(beats)).total_seconds() if beats else None
 
 
 RUN_METRICS: tuple[RunMetric, ...] = (
@@ -99,7 +100,7 @@ RUN_METRICS: tuple[RunMetric, ...] = (
     _run("actor_replacements_total", "How often an actor, the learner or the generator was replaced",
          lambda run, _: run.totals.replacements),
     _run("actor_heartbeat_age_seconds",
-         "Seconds from the oldest heartbeat of the actors that are up to the run's own, of an active run",
+         "Seconds from the oldest heartbeat of the actors that are up to the newest, of an active run",
          lambda run, _: _actor_age_s(run)),
     _of_record("valid_goals_ratio", "alice/valid_fraction", "Fraction of Alice's goals that are valid"),
     _of_record("lifted_goals_ratio", "alice/lifted_fraction", "Fraction of valid goals that are in the air"),

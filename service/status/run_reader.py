@@ -155,12 +155,12 @@ class CombinedReader(RunReader):
         try:
             return question(self._disk)
         except UnknownRunError:
-            in_redis = self._ask_redis(lambda: question(self._redis))
+            in_redis = self._ask_redis(lambda: (question(self._redis),))  # an answer may be None, too
             if in_redis is None and self._failure is not None:
                 raise self._away() from None
             if in_redis is None:
                 raise
-            return in_redis
+            return in_redis[0]
 
     def _away(self) -> StoreUnavailableError:
         reason = "" if self._failure is None else self._failure[1]

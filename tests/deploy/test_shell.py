@@ -54,7 +54,7 @@ def test_scripts_parse_and_stop_at_errors():
 
 def test_commands_in_yaml_parse():
     assert len(HEALTH_CHECKS) >= 5
-    assert len(PROBES) == 2
+    assert len(PROBES) == 3
     for script in (*redis_scripts().values(), *HEALTH_CHECKS, *PROBES):
         check_syntax(script.replace("$$", "$"))
 

@@ -108,9 +108,19 @@ def test_an_actor_that_has_not_started_is_not_silent(service):
 def test_an_actor_of_a_machine_whose_clock_is_slow_is_not_silent(service):
     client, runs = service
     then = datetime.now(UTC) - timedelta(seconds=30)
-    actors = tuple(actor.model_copy(update={"heartbeat": then}) for actor in status("cube").actors)
-    write_status(runs, "cube", heartbeat=then + timedelta(seconds=7), actors=actors)
+    actor, _, learner = status("cube").actors
+    late, newest = (then + timedelta(seconds=each) for each in (0, 7))
+    actors = actor.model_copy(update={"heartbeat": late}), learner.model_copy(update={"heartbeat": newest})
+    write_status(runs, "cube", heartbeat=newest, actors=actors)
     assert value(scrape(client), "tandem_run_actor_heartbeat_age_seconds", run="cube") == 7
+
+
+def test_actors_are_not_silent_while_the_run_measures_at_its_end(service):
+    client, runs = service
+    now = datetime.now(UTC)
+    actors = tuple(each.model_copy(update={"heartbeat": now - timedelta(hours=1)}) for each in status("cube").actors)
+    write_status(runs, "cube", heartbeat=now, actors=actors)
+    assert value(scrape(client), "tandem_run_actor_heartbeat_age_seconds", run="cube") == 0
 
 
 def test_the_registry(tmp_path, home):

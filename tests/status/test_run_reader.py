@@ -106,6 +106,20 @@ def test_a_request_to_stop_goes_to_both(reader, redis, root):
     reader.request_stop("far")  # has ended
 
 
+def test_a_run_of_redis_alone_that_has_no_record_yet(root, tmp_path):
+    redis = RedisServer(tmp_path)
+    try:
+        writer = a_writer(redis.address, "begun")
+        writer.status(status("begun", iteration=0))
+        writer.close()
+        reader = CombinedReader(DiskReader(root), RedisReader(redis.address))
+        assert reader.newest("begun") is None
+        assert reader.goals("begun") is None
+        assert reader.metrics("begun") == []
+    finally:
+        redis.close()
+
+
 @pytest.mark.parametrize("call", ["run", "metrics", "goals", "request_stop"])
 def test_an_unknown_run(reader, call):
     with pytest.raises(UnknownRunError, match=r"no run 'nobody'"):
