@@ -2,13 +2,15 @@
 
     python -m benchmarks.record_run runs/cube --out docs/results/runs/cube-0.json
     python -m benchmarks.record_run runs/lsd-0 --skills --out docs/results/skills/lsd-0.json
+    python -m benchmarks.record_run panda-cube@1 --skills --registry DIRECTORY --out docs/results/skills/ours-0.json
 
 It holds the configuration, the metrics thinned to at most 300 points, a sample of the goals in the layout of
 ``goals.jsonl`` and counts of all of them, and what is measured here: the newest Bob on every task (``TASKS``), and
 the coverage of random compositions at three stages of training. That takes a minute or two.
 
 With ``--skills`` it holds less: at most 100 points, and the coverage of random skills of 50 steps, an episode of the
-downstream tasks. Of self-play a skill is a random composition of the primitives.
+downstream tasks. Of self-play a skill is a random composition of the primitives. Of a published version the end alone
+is known.
 """
 
 from __future__ import annotations
@@ -42,6 +44,7 @@ from service.media.figures import read_records
 from service.policies.frozen_skills import FrozenSkills
 from service.policies.numpy_policy import NumpyMCPPolicy, numpy_bob
 from service.policies.parameters import Parameters
+from service.registry.loading import Trained, load
 from service.store.checkpoints import CheckpointStore, read_checkpoint
 from service.store.run_directory import RunDirectory
 
@@ -120,15 +123,20 @@ def measure_run(directory: RunDirectory) -> dict[str, Any]:
     return {"evaluations": measure_tasks(newest, config), "coverage": measure_coverage(bobs, config)}
 
 
-def record_skills(directory: RunDirectory, name: str) -> Run:
-    """Everything that is kept of a run of skills, or of self-play as skills."""
-    config = directory.read_config()
-    coverage = measure_coverage(read_stages(directory), config, num_steps=EPISODE_STEPS)
+def record_skills(run: RunDirectory | Trained, name: str) -> Run:
+    """Everything that is kept of a run of skills, or of self-play as skills; of a published version its end."""
+    if isinstance(run, RunDirectory):
+        config, stages = run.read_config(), read_stages(run)
+        series = thin(read_records(run.metrics_file), SKILL_POINTS, KEPT_OF_SKILLS)
+    else:
+        env_steps = int(run.manifest.metrics["env_steps"])
+        config, stages, series = run.config, {env_steps: run.parameters}, {"env_steps": [env_steps]}
+    coverage = measure_coverage(stages, config, num_steps=EPISODE_STEPS)
     if coverage is None:
-        raise TandemError(f"{directory.path} has a monolithic Bob, who has no skills; name another run")
+        raise TandemError(f"{name} has a monolithic Bob, who has no skills; name another run")
     return head_of(config, name) | {
         "method": config.skills.method if isinstance(config, SkillDiscoveryConfig) else OURS,
-        "series": thin(read_records(directory.metrics_file), SKILL_POINTS, KEPT_OF_SKILLS),
+        "series": series,
         "coverage": coverage,
     }
 
@@ -266,12 +274,16 @@ def _measure_sets(play: _Player, config: Config, num_sets: int) -> dict[str, Any
 def main() -> int:
     """Parse the command line, read, measure, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+    parser.add_argument("run", metavar="RUN_DIR|NAME@ALIAS", help="the second with --skills")
+    parser.add_argument("--registry", default="registry", help="of a published version (default: registry)")
     parser.add_argument("--out", type=Path, metavar="FILE", required=True, help="its stem is the run's name")
     parser.add_argument("--skills", action="store_true", help="where its random skills take the object, and less else")
     given = parser.parse_args()
-    directory, name = RunDirectory(given.run_dir), given.out.stem
-    run = record_skills(directory, name) if given.skills else record_run(directory, name) | measure_run(directory)
+    directory, name = RunDirectory(Path(given.run)), given.out.stem
+    if given.skills:
+        run = record_skills(directory if directory.exists else load(given.run, given.registry), name)
+    else:
+        run = record_run(directory, name) | measure_run(directory)
     write_json(given.out, run)
     print(f"{given.out}: {given.out.stat().st_size / 1000:.0f} kB")
     return 0

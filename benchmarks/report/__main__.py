@@ -41,7 +41,7 @@ PAGES = {
     "results/pretraining-v1.md": ("tasks", "curves", "curriculum", "coverage", "throughput"),
     "results/deployed.md": ("checks",),
     "results/skills.md": ("today", "phi", "coverage", "curves"),
-    "results/comparison.md": ("rows", "longer", "below", "harder", "missing"),
+    "results/comparison.md": ("rows", "longer", "harder", "missing"),
     "downstream.md": ("headline",),
     "robots.md": ("robots",),
     "results/transfer.md": ("transfer", "transfer_champion"),
@@ -214,7 +214,6 @@ class Report:
         blocks = {
             "rows": [comparison.comparison_table(trials, as_paper)],
             "longer": [],
-            "below": [comparison.distances_table(trials)],
             "harder": [comparison.harder_table(trials)],
             "missing": [comparison.missing_table(list(experiments(self._results / RESULTS.name)))],
         }

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
-from benchmarks.report.downstream import BEST, PAPER, Seeds, each_seed, mean_until, methods_table
-from benchmarks.report.markdown import Row, millions, percent
+from benchmarks.report.downstream import BEST, PAPER, Seeds, each_seed, mean_until
+from benchmarks.report.markdown import Row, from_to, millions, percent
 from benchmarks.report.results import TRIAL, Result, by_method_and_task
 from benchmarks.reproduce import MANY_UPDATES, PAPER_PRIMITIVES, Experiment
 from service.actors.evaluation import wilson_interval
@@ -63,13 +61,6 @@ def longer_table(results: Sequence[Result], longer: Sequence[Result], more_updat
                 )
                 rows.append((TASK_METHODS[method].title + words, *cells))
     return table(("", *(find_task(task).title for task in tasks)), rows)
-
-
-def distances_table(results: Sequence[Result]) -> str:
-    """Mean distance between object and goal at the end of the final episodes, of what learns from nothing."""
-    of = {place: seeds for place, seeds in by_method_and_task(results).items() if place[0] in learning(None)}
-    words = "Distance of the object from the goal at the end of the final episodes, mean of episodes and seeds:"
-    return f"{words}\n\n{methods_table(of, _mean_distance).rstrip()}" if of else ""
 
 
 def harder_table(results: Sequence[Result]) -> str:
@@ -146,8 +137,8 @@ def _compared(title: str, method: str, of: Mapping[tuple[str, str], list[Result]
     """A method's row beside the paper's rates."""
     found = [of.get((method, task), []) for task in PAPERS]
     cells = [_cell(seeds, PAPER[method][task]) for seeds, task in zip(found, PAPERS, strict=True)]
-    counts = sorted({len(seeds) for seeds in found if seeds})
-    return title, *cells, " to ".join(map(str, counts)) or "0"
+    counts = [len(seeds) for seeds in found if seeds]
+    return title, *cells, from_to(counts) if counts else "0"
 
 
 def _mean(seeds: Seeds) -> str:
@@ -157,10 +148,6 @@ def _mean(seeds: Seeds) -> str:
 def learning(takes: str | None) -> list[str]:
     """Names of the methods that learn downstream with what they take, ``"skills"`` for one; None: from nothing."""
     return [name for name, method in TASK_METHODS.items() if method.takes == takes and method.learns]
-
-
-def _mean_distance(trials: Sequence[Result]) -> str:
-    return f"{np.mean([each['evaluation']['mean_distance_m'] for each in trials]):.2f} m"
 
 
 def _cell(seeds: Seeds, paper: float) -> str:

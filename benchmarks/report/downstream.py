@@ -87,7 +87,8 @@ def write_page(results: Sequence[Result]) -> str:
         "the method has after so many env steps, not what it would come to.\n",
         "## Env steps and time\n",
         "Env steps in thousands, minutes of wall-clock time, with the evaluations on the way. Before the plus sign "
-        "what the primitives or skills took, in millions of env steps: all tasks have the same.\n",
+        "what the primitives or skills took, in millions of env steps: all tasks have the same. Minutes do not compare "
+        "methods: the machines were of two kinds, and did other work beside the trials.\n",
         methods_table(of, _cost),
         *_efficiency(of),
         *_harder(of),

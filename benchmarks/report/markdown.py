@@ -20,6 +20,11 @@ def millions(env_steps: float) -> str:
     return f"{env_steps / 1e6:.3g} M"
 
 
+def from_to(numbers: Sequence[int]) -> str:
+    """The least and the greatest of some numbers, as ``1 to 3``; a single one where all are equal."""
+    return " to ".join(map(str, dict.fromkeys((min(numbers), max(numbers)))))
+
+
 def duration(seconds: float) -> str:
     """Minutes, or hours from two on."""
     return f"{seconds / 3600:.1f} h" if seconds >= 7200 else f"{seconds / 60:.0f} min"

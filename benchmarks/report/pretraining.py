@@ -193,7 +193,7 @@ def why_alice_words(studies: Mapping[str, Mapping[str, Any]]) -> str:
         f"{mean['no-difficulty']} if she earns nothing by his failures."
         f"\nIf goals from the whole workspace are added, he solves {mean['uniform']}; {mean['uniform-new-alice']} "
         f"({min(random):.0f} to {max(random):.0f} by seed) if Alice does not learn, "
-        f"{mean['uniform-alone']} without Alice (means of {num_seeds} seeds)."
+        f"{mean['uniform-alone']} without Alice (means of the {num_seeds} tuning seeds)."
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.report.comparison import GOOD, learning
 from benchmarks.report.downstream import Seeds, mean_until
-from benchmarks.report.markdown import millions, percent
+from benchmarks.report.markdown import from_to, millions, percent
 from benchmarks.report.results import Result, by_method_and_task
 from benchmarks.reproduce import MANY_UPDATES
 from service.base.types import FloatArray
@@ -89,5 +89,5 @@ def _means(seeds: Seeds, steps: Sequence[int]) -> FloatArray:
 
 def _seeds_words(places: Sequence[Seeds]) -> str:
     """Such as ``(1 seed)``, or ``(1 to 3 seeds)`` where these methods and tasks had unequal numbers."""
-    counts = sorted({len(seeds) for seeds in places})
-    return f"({' to '.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'})"
+    counts = from_to([len(seeds) for seeds in places])
+    return f"({counts} {'seed' if counts == '1' else 'seeds'})"

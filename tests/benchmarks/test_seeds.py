@@ -133,7 +133,7 @@ def test_what_alice_is_for_by_hand():
     words = why_alice_words(dict.fromkeys(ARMS, study(0.1, 0.2)) | some)
     assert "solves 96 % of random goals; 50 % without cloning her turns; 15 % if she earns nothing by" in words
     assert "solves 15 %; 15 % (10 to 20 by seed) if Alice does not learn, 15 % without Alice" in words
-    assert words.endswith(" (means of 3 seeds).")
+    assert words.endswith(" (means of the 3 tuning seeds).")
 
 
 @pytest.mark.parametrize("name", ARMS)

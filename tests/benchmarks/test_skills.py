@@ -1,13 +1,14 @@
 """Recorded skill-discovery runs, and self-play recorded as skills."""
 
 import json
+import re
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from benchmarks import measuring, record_run, run_files
-from benchmarks.report.skills import episodes_table, phi_table
+from benchmarks.report.skills import coverage_table, episodes_table, phi_table
 from benchmarks.steps_in_phi import steps_in_phi
 from service.actors.coverage import skill_paths, visited_share
 from service.base.errors import TandemError
@@ -15,6 +16,7 @@ from service.config import parse_config
 from service.config.skills import SkillsConfig
 from service.config.world import WorkspaceConfig
 from service.policies.frozen_skills import FrozenSkills
+from service.registry.loading import load
 from service.store.run_directory import RunDirectory
 from tests.methods.test_skill_run import play, small_config
 from tests.runs.runs import TREE
@@ -58,6 +60,15 @@ def test_self_play_is_recorded_as_skills(tmp_path):
     assert run["method"] == "ours"
     assert "bob/env_steps_fraction" in run["series"]
     assert not any(name.startswith("alice/") for name in run["series"])
+
+
+def test_a_published_version_is_recorded_by_its_end():
+    champion = load("panda-cube@champion")
+    run = record_run.record_skills(champion, "ours-0")
+    assert run["series"] == {"env_steps": [champion.manifest.metrics["env_steps"]]}
+    assert run["coverage"]["stages"].keys() == {run_files.RANDOM, "end"}
+    row = coverage_table([run]).splitlines()[-1]
+    assert re.fullmatch(r"\| ours \| 1 \| 10 M \|  \|  \| [1-9][\d.]* % \|", row)
 
 
 def test_a_monolithic_bob_is_refused(tmp_path):
