@@ -128,6 +128,8 @@ def record_skills(run: RunDirectory | Trained, name: str) -> Run:
     if isinstance(run, RunDirectory):
         config, stages = run.read_config(), read_stages(run)
         series = thin(read_records(run.metrics_file), SKILL_POINTS, KEPT_OF_SKILLS)
+    elif run.manifest is None:
+        raise TandemError(f"{run.label} is not published: name a run directory or NAME@ALIAS")
     else:
         env_steps = int(run.manifest.metrics["env_steps"])
         config, stages, series = run.config, {env_steps: run.parameters}, {"env_steps": [env_steps]}

@@ -198,11 +198,13 @@ class Report:
     def skills_blocks(self, runs: Sequence[Run], todays: Sequence[Run]) -> Blocks:
         """Parts of the blocks about skills: those of version 1 of what learns, and today's."""
         stages = self.show("Random skills at three stages of training", "skills", figures.draw_skills, runs)
-        learned = [run for run in runs if run["method"] != "ours"]
+        learned, learned_today = ([run for run in some if run["method"] != "ours"] for some in (runs, todays))
         curves = self.show("Skill discovery over env steps", "skills-curves", figures.draw_skill_curves, learned)
-        again = self.show("Skill discovery over env steps", "skills-curves-today", figures.draw_skill_curves, todays)
+        again = self.show(
+            "Skill discovery over env steps", "skills-curves-today", figures.draw_skill_curves, learned_today
+        )
         return {
-            "today": [skills.coverage_table(todays), skills.episodes_table(todays), again],
+            "today": [skills.coverage_table(todays), skills.episodes_table(learned_today), again],
             "coverage": [skills.coverage_table(runs), stages],
             "curves": [curves],
         }

@@ -22,6 +22,8 @@ GOOD = 0.9
 _PAPER_RECIPE = next(iter(PAPER_PRIMITIVES.values())).partition("@")[0]
 OWN = "ours-her"
 """The composing method of the summary."""
+OWN_ALONE = "ours"
+"""The same without hindsight, as the paper has it."""
 _PAPER_SEEDS = 3
 """Of every rate of the paper, as its table says."""
 
@@ -183,8 +185,18 @@ def headline_table(results: Sequence[Result]) -> str:
                 (words, *(_best([rates[name, task] for name in found if (name, task) in rates]) for task in PAPERS))
             )
     rows.append(("*the best of the paper*", *(f"*{percent(rate)} ({_PAPER_SEEDS})*" for rate in BEST.values())))
-    words = "Success at the last step, mean of the seeds; in brackets their number."
+    words = f"Success at the last step, mean of the seeds; in brackets their number.{_without_hindsight(rates)}"
     return f"{table(('', *(find_task(task).title for task in PAPERS)), rows)}\n\n{words}"
+
+
+def _without_hindsight(rates: Mapping[tuple[str, str], Rate]) -> str:
+    """A sentence on composing without hindsight, where every task has it: the task that differs most, and the rest."""
+    if not all((name, task) in rates for name in (OWN, OWN_ALONE) for task in PAPERS):
+        return ""
+    gaps = {task: abs(rates[OWN, task].mean - rates[OWN_ALONE, task].mean) for task in PAPERS}
+    most, *others = sorted(PAPERS, key=lambda task: -gaps[task])
+    there, points = percent(rates[OWN_ALONE, most].mean), f"{100 * gaps[others[0]]:.1f}"
+    return f" Composing without hindsight: {there} on *{find_task(most).title}*, else within {points} points."
 
 
 def _best(rates: Sequence[Rate]) -> str:
