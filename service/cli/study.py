@@ -225,7 +225,7 @@ def _registry(source: str, configs: Iterable[Config], publish: bool | None) -> P
 
     if publish is False:
         return None
-    best = {config.name: config for config in configs if config.makes == "primitives"}
+    best = {config.name: config for config in configs if config.makes == "primitives" and config.publishable}
     if publish and not best:
         raise TandemError(
             "--publish: a study publishes the best of its runs that make primitives, and it has none of these; "

@@ -246,11 +246,7 @@ def train_and_tell(
         from service.store.disk_reader import run_id_of
 
     runtime = training.Runtime()
-    if publish and config.makes is None:
-        raise TandemError(
-            f"--publish: a run of the method {config.method} makes nothing that can be published; leave it out"
-        )
-    publish = config.makes != "orchestrator" if publish is None else publish
+    publish = config.publishable and config.makes != "orchestrator" if publish is None else publish
     hint = how_to_go_on(directory.path, registry, typed)
     try:
         with traceback_in(directory.path), closing(directory), ExitStack() as stack:

@@ -113,13 +113,26 @@ def publish(
     )
 
 
+def check_makes(config: Config) -> None:
+    """Check that a run makes what can be published.
+
+    Raises:
+        TandemError: it makes nothing, or a Bob without primitives.
+    """
+    if config.makes is None:
+        raise TandemError(f"a run of the method {config.method} makes nothing that can be published")
+    if not config.publishable:
+        raise TandemError("a Bob without primitives (policy.monolithic_bob) cannot be published")
+
+
 def check_publishable(config: Config, registry: Path | str) -> None:
     """Check that what a run makes can be published in a registry.
 
     Raises:
-        TandemError: a registry that is only read; or a name that is that of something else; or, of a policy of a task,
-            primitives that are not published.
+        TandemError: see ``check_makes``; or a registry that is only read; or a name that is that of something else; or,
+            of a policy of a task, primitives that are not published.
     """
+    check_makes(config)
     if is_service(registry):
         raise TandemError(f"{registry} is read only: publish in a directory (--registry DIR), and serve that")
     target = Registry(Path(registry))
@@ -128,7 +141,7 @@ def check_publishable(config: Config, registry: Path | str) -> None:
         for version in place.versions(config.name)[-1:]:
             with contextlib.suppress(StorageError):  # a damaged version is mended by publishing again
                 kind = place.manifest(str(version)).spaces.get("kind", "primitives")
-                if config.makes not in (None, kind):
+                if config.makes != kind:
                     what = f"an {kind}" if kind == "orchestrator" else kind
                     raise TandemError(f"{config.name} is the name of {what} already: choose another name")
     if not isinstance(config, TaskConfig):

@@ -31,7 +31,7 @@ from service.methods.method import Method, StateLostError, WorkersError
 from service.methods.task_evaluation import FINAL_SEED, evaluate_on, numbers_of
 from service.registry.loading import Trained, load
 from service.registry.names import Version, check_name, is_service
-from service.registry.publishing import check_publishable, measure_bob, measure_skills, publish_run
+from service.registry.publishing import check_makes, check_publishable, measure_bob, measure_skills, publish_run
 from service.registry.registry import Registry
 from service.runs.report import Report
 from service.runs.run import Ending, OnBeat, OnIteration, Run
@@ -262,7 +262,7 @@ def _run(
 
 
 def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, report: Report) -> Finished:
-    publishing = "publishing, " * (publish and run.config.publishable)
+    publishing = "publishing, " * publish
     drawing = f", {publishing}drawing and recording a video" if run.config.makes is not None else ""
     _logger.info("learning is over; now evaluating%s", drawing)
     config, directory = run.config, run.directory
@@ -283,7 +283,7 @@ def _finish(done: Finished, run: Run, registry: Path | str, publish: bool, repor
     run.close()
     report.measured(metrics)
     try:
-        if publish and config.publishable:
+        if publish:
             known = metrics | {"env_steps": done.num_env_steps}
             version = publish_run(directory, Registry(Path(registry)), config, parameters, known)
     except TandemError as error:
@@ -317,10 +317,7 @@ def publish_learned(
     """
     directory = RunDirectory(path)
     config = directory.read_config()
-    if config.makes is None:
-        raise TandemError(f"{path} is a run of the method {config.method}, which makes nothing that can be published")
-    if not config.publishable:
-        raise TandemError(f"{path} has a Bob without primitives (policy.monolithic_bob): there is nothing to publish")
+    check_makes(config)
     changed = {"name": check_name(name or config.name)}
     directory.claim(resume=True)
     with closing(directory):

@@ -6,7 +6,15 @@ import pytest
 
 from service.base import files
 from service.base.errors import StorageError
-from service.base.files import Appender, open_regular, open_to_append, read_regular, write_atomic
+from service.base.files import (
+    Appender,
+    new_directory,
+    open_regular,
+    open_to_append,
+    read_regular,
+    write_atomic,
+    write_exclusive,
+)
 from tests.runs.runs import assert_one_line, no_room_above
 
 
@@ -166,6 +174,14 @@ def test_a_file_and_then_its_directory_are_flushed_or_nothing(tmp_path, monkeypa
     write_atomic(tmp_path / "a", b"x")
     assert len(flushed) == 2
     assert flushed[0] != flushed[1] == str(tmp_path)
+    flushed.clear()
+    assert write_exclusive(tmp_path / "b", b"x")
+    assert len(flushed) == 2
+    assert flushed[0] != flushed[1] == str(tmp_path)
+    flushed.clear()
+    with new_directory(tmp_path / "c"):
+        pass
+    assert flushed == [str(tmp_path)]
     flushed.clear()
     write_atomic(tmp_path / "a", b"x", flush=False)
     assert flushed == []

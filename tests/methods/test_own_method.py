@@ -1,15 +1,19 @@
 """A method from a user's file is trained, recorded, killed and resumed like those that come with the package."""
 
+from functools import partial
+
 import pytest
 
-from service.base.errors import ConfigError
+from service.base.errors import ConfigError, TandemError
 from service.config import load_config, parse_config
+from service.runs import train as training
 from service.runs.resuming import resumed_config
-from service.runs.train import train
 from service.store.models import read_status
 from service.store.run_directory import RunDirectory
 from tests.runs.runs import KilledError, assert_one_line, assert_same_run, newest, read_lines
 
+train = partial(training.train, publish=False)
+"""As the command does of what makes nothing that can be published."""
 CODE = """
 import numpy as np
 from pydantic import Field
@@ -221,6 +225,14 @@ def test_an_error_of_the_method_names_its_line(file, tmp_path, monkeypatch, old,
     with pytest.raises(ConfigError) as error:
         train(config_of(), RunDirectory(tmp_path / "run"), tmp_path / "registry", on_iteration=ignore)
     assert_one_line(error.value, said)
+
+
+@pytest.mark.usefixtures("default_signals", "file")
+def test_what_makes_nothing_to_publish_is_refused_before_it_learns(tmp_path):
+    directory = RunDirectory(tmp_path / "run")
+    with pytest.raises(TandemError, match="makes nothing that can be published"):
+        train(config_of(), directory, tmp_path / "registry", publish=True, on_iteration=ignore)
+    assert not directory.exists
 
 
 @pytest.mark.usefixtures("default_signals")

@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from service.base.errors import ConfigError
+from service.base.errors import ConfigError, TandemError
 from service.config import load_config, parse_config
 from service.envs import rules
 from service.envs.sampling import draw_goals
@@ -146,6 +146,14 @@ def test_a_finished_run_that_goes_on_publishes_another_version(home):
     assert done.num_env_steps >= 600
     registry = Registry(home / "registry")
     assert [registry.manifest(f"tiny@{number}").parent for number in (1, 2)] == [None, "tiny@1"]
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_bob_without_primitives_is_not_published(tmp_path):
+    config = parse_config(TREE | {"policy": TREE["policy"] | {"monolithic_bob": {"hidden_sizes": [8]}}}, where="a test")
+    with pytest.raises(TandemError, match="a Bob without primitives .* cannot be published"):
+        run_pretrain(tmp_path, config, publish=True)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_finished_run_with_nothing_left_to_do_publishes_nothing_and_mends_what_is_damaged(home):

@@ -23,7 +23,7 @@ _ARGUMENTS = (
     "--disable-sync",
     "--disable-dev-shm-usage",
 )
-_TIMEOUT_MS = 20_000
+_TIMEOUT_MS = 300_000
 _ABOUT_DRAWING = ("GPU stall", "willReadFrequently")
 """What Chromium says of any WebGL without a graphics card."""
 

@@ -44,7 +44,7 @@ def environment(tmp_path_factory):
 @pytest.mark.skipif(shutil.which("curl") is None, reason="the documents' examples call curl, which is not on PATH")
 @pytest.mark.parametrize("command", commands())
 def test_examples(environment, tmp_path, command):
-    checked = command.replace("curl ", "curl --fail-with-body --max-time 20 ", 1)
+    checked = command.replace("curl ", "curl --fail-with-body --max-time 300 ", 1)
     result = subprocess.run(
         ["sh", "-c", checked], env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False
     )
@@ -88,6 +88,8 @@ def test_numbers():
     assert f"more than {auth.MAX_BODY_BYTES // 1024} KiB" in TEXT
     assert f"{server.MAX_HEAD_BYTES // 1024} KiB of headers, {server.MAX_CONNECTIONS} connections" in TEXT
     assert f"At most {stream.MAX_STREAMS} streams" in TEXT
+    assert stream.MAX_AGE_S == 3600.0
+    assert "ends\nafter an hour" in TEXT
     assert f"After {routing._PING_INTERVAL:g} seconds without an event" in TEXT
 
 

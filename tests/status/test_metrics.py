@@ -217,6 +217,7 @@ def test_everything_served_is_in_the_reference(service):
     }
     own = {name for name in served if not name.startswith("tandem_process_") and not name.endswith("_created")}
     assert own == set(reference)
+    assert "tandem_process_resident_memory_bytes" in served
     for name in own:
         assert (served[name].type, served[name].documentation) == (reference[name].kind, reference[name].help)
         labels = {label for sample in served[name].samples for label in sample.labels} - {"le"}

@@ -229,7 +229,7 @@ def test_a_store_that_is_away(store):
 
 def test_many_readers_at_once(store):
     """While the run goes on, nobody sees a record twice, a gap, or half of one."""
-    writer, wrong, done = store.writer("cube"), [], threading.Event()
+    writer, wrong, ends, done = store.writer("cube"), [], [], threading.Event()
     writer.status(a_status())
     writer.metrics(a_record(1))
     wait_until(lambda: store.reader.runs() != [])
@@ -242,6 +242,7 @@ def test_many_readers_at_once(store):
             if found != list(range(last + 1, last + 1 + len(found))) or store.reader.run("cube").iteration > 60:
                 wrong.append((last, found))
             last = max([last, *found])
+        ends.append(last)
 
     threads = [threading.Thread(target=read) for _ in range(6)]
     for thread in threads:
@@ -251,7 +252,9 @@ def test_many_readers_at_once(store):
         writer.status(a_status(iteration=number))
     writer.close()
     for thread in threads:
-        thread.join(20.0)
-        done.set()
-    assert wrong == []
+        thread.join(60.0)
+    done.set()
+    for thread in threads:
+        thread.join()
+    assert (wrong, ends) == ([], [60] * 6)
     assert len(store.reader.metrics("cube")) == 60

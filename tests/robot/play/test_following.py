@@ -1,10 +1,13 @@
 """A run that goes on, as those see it who watch: newer players, and how far it is."""
 
+import threading
 from contextlib import closing
 
 import numpy as np
 import pytest
 
+from service.base.errors import StorageError
+from service.robot.play import following
 from service.robot.play.following import Following, goal_map, is_running
 from service.robot.play.game import Game
 from service.runs.train import train
@@ -15,7 +18,7 @@ from tests.runs.runs import KilledError, tiny_config
 
 @pytest.mark.usefixtures("default_signals")
 def test_a_run_is_followed_from_checkpoint_to_checkpoint(tmp_path, monkeypatch):
-    """The thread does no more than this does by hand."""
+    """The thread does no more than this by hand, again and again."""
     monkeypatch.setattr(Following, "_follow", lambda self: None)
     path, seen = tmp_path / "run", []
 
@@ -32,8 +35,8 @@ def test_a_run_is_followed_from_checkpoint_to_checkpoint(tmp_path, monkeypatch):
     config = tiny_config(checkpoint_interval=1, evaluation_interval=1, evaluation_episodes=2)
     with pytest.raises(KilledError):
         train(config, RunDirectory(path), tmp_path / "registry", publish=False, on_iteration=watch)
-    following, first, second = seen
-    with closing(following):
+    followed, first, second = seen
+    with closing(followed):
         for learning in (first, second):
             assert learning.total_env_steps == config.run.total_env_steps
             assert 0.0 <= learning.success <= 1.0
@@ -46,6 +49,24 @@ def test_a_run_is_followed_from_checkpoint_to_checkpoint(tmp_path, monkeypatch):
         assert game.alice is second.players.alice
         for _ in range(3):
             game.step()
+
+
+def test_it_looks_again_and_again_also_after_a_look_that_failed(tmp_path, monkeypatch):
+    looks, again = [], threading.Event()
+
+    def look(self):
+        looks.append(None)
+        if len(looks) == 1:
+            raise StorageError("a file that is replaced meanwhile")
+        again.set()
+
+    monkeypatch.setattr(following, "LOOK_S", 0.01)
+    monkeypatch.setattr(Following, "look", look)
+    with closing(Following(tmp_path, tmp_path)):
+        assert again.wait(60.0)
+    num = len(looks)
+    assert not any(thread.name == "following" for thread in threading.enumerate())
+    assert len(looks) == num
 
 
 def test_a_place_that_is_no_run_is_none_that_goes_on(tmp_path):
