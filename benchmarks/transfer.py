@@ -217,7 +217,7 @@ def _play(policy: Trained, backend: Backend, goal: StateArray, settings: Setting
     except RobotError as error:
         stopped = str(error)
     last = float(np.linalg.norm(simulator.object_position() - goal))
-    gap_s = world.physics_step_s * world.num_substeps / num
+    gap_s = world.step_s / num
     insides = [_steps_inside(np.array(path), gap_s, num) for path in (tip, set_points)]
     free = np.diff(touches) == 0
     return Played(

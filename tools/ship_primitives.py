@@ -3,8 +3,8 @@
     tandem publish runs/cube
     python -m tools.ship_primitives panda-cube@latest --registry registry
 
-``service/registry`` is a registry like any other, except that only this script writes there. What it ships gets the
-next number and the aliases champion and latest; older versions of its name are removed: the package stays small.
+``service/registry/data`` is a registry like any other, except that only this script writes there. What it ships gets
+the next number and the aliases champion and latest; older versions of its name are removed: the package stays small.
 """
 
 from __future__ import annotations

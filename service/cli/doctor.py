@@ -29,7 +29,7 @@ def doctor(as_json: JsonOption = False) -> None:
     import torch
 
     threads = os.cpu_count() or 1
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else threads
+    usable = len(os.sched_getaffinity(0))
     missing = [extra for extra, package in _EXTRAS.items() if importlib.util.find_spec(package) is None]
     memory_gb, disk_gb = _free_memory_gb(), shutil.disk_usage(Path.cwd()).free / 1e9
     rows = [

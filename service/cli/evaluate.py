@@ -121,8 +121,6 @@ def evaluate(
     if out is not None:
         check_place(out)
     config = changed_config(trained.config, overrides or ())
-    world, distance_m = replace(trained, config=config).world, trained.success_distance_m
-    tried = trained.on_goals(cast("GoalKind | None", asked))
     of, first_seed = ("", seed) if on is None else (f" of {on.title}", seed + FINAL_SEED)
     if (num := config.world.num_objects) != (known_num := trained.config.world.num_objects):
         raise TandemError(f"--set: {trained.label} was trained in a world of {known_num}, not of {num} objects")
@@ -133,6 +131,9 @@ def evaluate(
             f"--set: {trained.label} sees what it was trained to see, and {more} would be new or gone: leave "
             "world.observed as it is"
         )
+    trained = replace(trained, config=config)
+    tried = trained.on_goals(cast("GoalKind | None", asked))
+    world, distance_m = trained.world, trained.success_distance_m
     with redirect_stdout(sys.stderr):  # what functions of a task print is no result
         rows = {
             name: run(

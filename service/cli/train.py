@@ -247,7 +247,7 @@ def train_and_tell(
 
     runtime = training.Runtime()
     publish = config.publishable and config.makes != "orchestrator" if publish is None else publish
-    hint = how_to_go_on(directory.path, registry, typed)
+    hint, has_learned = how_to_go_on(directory.path, registry, typed), False
     try:
         with traceback_in(directory.path), closing(directory), ExitStack() as stack:
             if cluster is not None:
@@ -261,10 +261,9 @@ def train_and_tell(
             tracked = stack.enter_context(closing(Trackers(trackers, run_id_of(directory.path), tree)))
             progress = stack.enter_context(closing(Progress(shown())))
 
-            iterations = list[float]()
-
             def tell(metrics: dict[str, float]) -> Ending | None:
-                iterations.append(metrics["iteration"])
+                nonlocal has_learned
+                has_learned = True
                 progress.show(metrics, config.run.total_env_steps)
                 tracked.log(metrics)
                 return until(metrics)
@@ -279,7 +278,7 @@ def train_and_tell(
     except InterruptError as interrupt:
         raise stopped("stopped at once", interrupt.number, hint, begun=directory.exists) from None
     typer.echo(f"\n{done.reason} after {done.num_env_steps:,} env steps, {done.iteration} iterations")
-    if resume and done.reason == "finished" and not iterations:
+    if resume and done.reason == "finished" and not has_learned:
         budget = f"{config.run.total_env_steps:,}"
         typer.echo(f"nothing was left to learn: run.total_env_steps is {budget}; raise it by --set to go on")
     typer.echo(done.timing)

@@ -235,6 +235,11 @@ class WorldConfig(FrozenModel):
         return self
 
     @property
+    def step_s(self) -> float:
+        """Time of an env step."""
+        return self.physics_step_s * self.num_substeps
+
+    @property
     def num_objects(self) -> int:
         """K, objects that have goals."""
         return len(self.objects) or 1

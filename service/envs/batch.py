@@ -74,7 +74,7 @@ class WorldBatch:
         log = mujoco.MjLogConfig.get()  # MuJoCo's own log is a file in the working directory
         log.logto_file = log.logto_console = False
         log.set()
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        cores = len(os.sched_getaffinity(0))
         num_threads = self._num_threads = min(num_threads or cores, num_worlds)
         self._pool = rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._closed = False
@@ -94,7 +94,7 @@ class WorldBatch:
         """Share of later starts with a blocked gripper; more than 0 only where it was when the batch was made."""
         self._control_spec = _CONTROL_AND_BOX if self.model.nmocap else int(mujoco.mjtState.mjSTATE_CTRL)
         self.reach.check(config.workspace, robot.name, self.robot.arm)
-        self._widest_m = self.robot.opening_m if config.gripper == "free" else 0.0
+        self._widest_m = self.robot.widest_m
         self._fresh_state = self._make_fresh_state()
         self.states: StateArray = np.tile(self._fresh_state, (num_worlds, 1))
         """(N, S)."""
@@ -373,7 +373,7 @@ class WorldBatch:
             self._seen_object = self._seen_object + self.states[:, self.layout["object_offset"]]
         if drawn.object_noise_m is not None:
             std, key = self.states[:, self.layout["object_noise"]].T
-            steps = np.rint(self.states[:, 0] / (self.config.physics_step_s * self.config.num_substeps))
+            steps = np.rint(self.states[:, 0] / self.config.step_s)
             self._seen_object = self._seen_object + std[:, None] * normal(key, steps, 3 * self.config.num_objects)
 
     def contacts(self) -> BoolArray:

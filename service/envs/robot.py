@@ -77,6 +77,8 @@ class Robot:
         self.num_joints, self.num_fingers = len(robot.joints), len(robot.fingers)
         self.opening_m = robot.opening_m
         """Between the fingertips where the gripper is open."""
+        self.widest_m = robot.opening_m if config.gripper == "free" else 0.0
+        """The same, or 0 for a gripper that is blocked."""
         prefix = _prefix(robot)
         self.arm = Chain(
             model,

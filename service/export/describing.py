@@ -78,9 +78,9 @@ def describe(
     world, frozen = trained.world, trained.acts_with
     robot, seen = described(world), layouts(world)
     parts = {"policy": trained} if frozen is None else {"orchestrator": trained, "primitives": frozen}
-    widest_m = robot.opening_m if world.gripper == "free" else 0.0
     with WorldBatch(world, 1) as worlds:
         joints = dict(zip(robot.joints, worlds.joints[0].tolist(), strict=True))
+        widest_m = worlds.robot.widest_m
         effector_m, reach, fixtures = worlds.ee_position[0].tolist(), worlds.reach, _fixtures(worlds.model)
         width_m = float(worlds.robot.openings(worlds.states[:, worlds.layout["fingers"]]).sum())
         turn = bool(worlds.robot.turning.any())
@@ -97,13 +97,13 @@ def describe(
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
             "sha256": {part: digest_of("", each.parameters) for part, each in parts.items()},  # what went in
         },
-        "rate_hz": 1.0 / (world.physics_step_s * world.num_substeps),  # of observations and actions
+        "rate_hz": 1.0 / world.step_s,  # of observations and actions
         "networks": [_network(file, *found) for file, found in networks.items()],
         "observation": [field for entry in seen.bob.entries for field in _fields(entry, seen)],
         "observation_size": seen.bob.size,
         "positions_size": seen.positions.size,  # the first numbers of an observation, all that primitives see
         "action": _action(),
-        "command": _command(1e3 * world.physics_step_s * world.num_substeps, robot.lowest_m, widest_m),
+        "command": _command(1e3 * world.step_s, robot.lowest_m, widest_m),
         "frame": {  # of all positions
             "origin": "the table top, in the middle of the table's width; of the Panda 0.6 m in front of its base",
             "axes": "x away from the robot's base, y to the robot's left, z up",

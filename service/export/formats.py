@@ -48,8 +48,7 @@ def find_format(name: str) -> Format:
     """Find a format by its name.
 
     Raises:
-        TandemError: no such format.
-        TandemError: packages that it needs are not installed.
+        TandemError: no such format, or packages that it needs are not installed.
     """
     if name not in FORMATS:
         raise TandemError(f"unknown format {name!r}; choose one of {', '.join(FORMATS)}{did_you_mean(name, FORMATS)}")

@@ -85,7 +85,7 @@ def measure_response(world: WorldConfig) -> Measured:
     empty = world.model_copy(update={"fixture": "none", "fixtures": (), "obstacles": (), "observed": seen})
     rng = np.random.default_rng(REPORTED_SEED)
     with WorldBatch(empty, _NUM_PLACES) as worlds:
-        widest_m = worlds.robot.opening_m if world.gripper == "free" else 0.0
+        widest_m = worlds.robot.widest_m
         return {
             "response": [_axis_response(worlds, rng, axis, direction) for axis in range(3) for direction in (1, -1)],
             "width_response": [_width_response(worlds, rng, direction, widest_m) for direction in (1, -1)],
@@ -162,7 +162,7 @@ def _width_response(worlds: WorldBatch, rng: np.random.Generator, direction: int
 
 def _motion(tip: StateArray, world: WorldConfig) -> Measured:
     """Speed and acceleration of (T, E, 3) positions of the tip, metres, a step apart."""
-    step_s = world.physics_step_s * world.num_substeps
+    step_s = world.step_s
     velocity = np.diff(tip, axis=0) / step_s
     acceleration = np.diff(velocity, axis=0) / step_s
     outside = (tip < world.workspace.lower_m) | (tip > world.workspace.upper_m)

@@ -76,7 +76,7 @@ def write_video(
         frames = (
             frame
             for number, each in numbered
-            for frame in _round_frames(renderer, each, f"{number}/{len(rounds)}", stride, frame_s, _step_s(config))
+            for frame in _round_frames(renderer, each, f"{number}/{len(rounds)}", stride, frame_s, config.step_s)
         )
         return encode(frames, path, fps=1 / frame_s)
 
@@ -174,13 +174,9 @@ def _episode_frames(
     yield from _hold(frame, END_PAUSE_S, frame_s)
 
 
-def _step_s(config: WorldConfig) -> float:
-    return config.physics_step_s * config.num_substeps
-
-
 def _timing(config: WorldConfig, speed: float) -> tuple[int, float]:
     """How many states a frame stands for, more than 1 where the film is fast, and its seconds."""
-    state_s = _step_s(config) / speed
+    state_s = config.step_s / speed
     stride = max(math.ceil(1 / (MAX_FPS * state_s) - 1e-9), 1)
     return stride, stride * state_s
 

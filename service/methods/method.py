@@ -47,7 +47,7 @@ class Iteration:
     metrics: Metrics
     """By name, such as ``bob/success_rate``; ``iteration`` and ``env_steps`` among them."""
     goals: StateArray | None = None
-    """(M, 7) a sample of its goals: start x y z, goal x y z (metres), solved 0/1; None for a method without goals."""
+    """(M, 6 K + 1) a sample of its goals: starts of K objects, their goals (x y z, metres), solved 0/1; or None."""
     diverged: Mapping[str, Diverged] = field(default_factory=dict)
     """By the name of a round: states and actions of worlds whose physics diverged in it."""
 
@@ -58,7 +58,7 @@ class Health:
 
     actors: tuple[ActorStatus, ...]
     num_rollouts_counted: int
-    """Learned from, by the processes that run now."""
+    """Learned from; on a cluster those of the processes that run now."""
     num_rollouts_refused: int = 0
     warnings: tuple[str, ...] = ()
     last_error: str | None = None
@@ -107,7 +107,7 @@ class Method(ABC):
         """Whether there is nothing more to learn; the run then ends before its budget is spent."""
         self.timing = Timing()
         self.on_wait: Callable[[], None] = lambda: None
-        """Called about every second while ``step`` or ``start`` wait for another process."""
+        """To be called again and again while ``step`` or ``start`` wait for another process."""
 
     @property
     def remedy(self) -> str:

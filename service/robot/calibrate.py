@@ -132,7 +132,7 @@ def measure_response(
         shares[index] = covered / (DISPLACEMENT_M * _ACTION)
         delays[index] = _delay_s(rows[motions.first(index) :], direction)
     x, y, z = shares.reshape(2, 3).mean(axis=0).round(4).tolist()
-    step_s = world.physics_step_s * world.num_substeps
+    step_s = world.step_s
     seen = delays[np.isfinite(delays)]  # an arm that still swings back from the way before may hide one
     if not seen.size:
         raise RobotError(
@@ -202,7 +202,7 @@ def _setting(robot: str, world: WorldConfig, config: BridgeConfig) -> dict[str, 
     return {
         "robot": robot,
         "arm": described(world).name,
-        "step_s": round(world.physics_step_s * world.num_substeps, 9),
+        "step_s": round(world.step_s, 9),
         "set_points_per_step": config.set_points_per_step,
         "max_speed_m_s": config.safety.max_speed_m_s,
         "max_acceleration_m_s2": config.safety.max_acceleration_m_s2,

@@ -85,7 +85,7 @@ class Bridge:
         self._layout = layouts(world).positions
         self._num_commands = world.observed.num_commands
         self._blocked = world.gripper == "blocked"
-        self._step_s = world.physics_step_s * world.num_substeps
+        self._step_s = world.step_s
         self._tick_s = self._step_s / config.set_points_per_step
         self.safe = SafeRobot(robot, poses, config.safety, world, held=held, dry_run=dry_run)
         """The only way to the robot."""

@@ -64,7 +64,7 @@ class MujocoRobot:
             self._start = batch.states[0].copy()
         self._fingers = slice(self._robot.num_joints, self._robot.num_joints + self._robot.num_fingers)
         """Their joints and their actuators."""
-        self._widest_m = self._robot.opening_m if self.world.gripper == "free" else 0.0
+        self._widest_m = self._robot.widest_m
         self._fit(given)
         self._data = mujoco.MjData(self.model)
         self._stopped = False

@@ -37,8 +37,6 @@ MAX_IDLE = 1000
 """Iterations in a row without env steps: a run of them would never end."""
 _OWN = ("time/wall_s", "time/env_steps_per_s")
 """Metrics that a run adds."""
-_GOAL_COLUMNS = 7
-"""Of ``Iteration.goals``."""
 BEAT_S = 1.0
 """Time between two heartbeats of a run whose iterations take longer."""
 _logger = logging.getLogger(__name__)
@@ -264,10 +262,11 @@ class Run:
         if goals is None:
             return
         self._expect(isinstance(goals, np.ndarray), "the Iteration's goals", goals, "an array, or None")
-        if goals.ndim != 2 or goals.shape[1] != _GOAL_COLUMNS or goals.dtype.kind not in "fiu":
+        columns = 6 * self.config.world.num_objects + 1
+        if goals.ndim != 2 or goals.shape[1] not in (7, columns) or goals.dtype.kind not in "fiu":
             raise CodeError(
                 f"{self._origin}: the goals of an Iteration are {goals.dtype} of shape {goals.shape}; give numbers of "
-                f"shape (M, {_GOAL_COLUMNS}), or None"
+                f"shape (M, {columns}), or None"
             )
 
     def _check_attributes(self) -> None:

@@ -22,7 +22,7 @@ STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, PASSED_ON)
 _MAY_COME_TWICE = (signal.SIGHUP, PASSED_ON)
 """The kernel and the shell both tell of a terminal that closes: that is one stop, and not a second signal."""
 PARENT = "TANDEM_STUDY_PROCESS"
-"""Variable of the environment with the id of the process above that a run of a study ends with."""
+"""Variable of the environment with the id of the process that a run of a study, or the demo's live world, ends with."""
 _PR_SET_PDEATHSIG = 1
 """From linux/prctl.h."""
 

@@ -47,7 +47,7 @@ from service.store.run_writer import RunWriter, reporting_to
 MAX_STATES_LOST = 5
 """Times in a row that a run goes back to a checkpoint without getting beyond it."""
 BACK_OFF_S = 2.0
-"""Pause before the second time; it doubles."""
+"""The pauses from the second time on are this, then three and seven times as long."""
 END_S = 5.0
 """Most time to tell how a run ended whose process is ended at once."""
 _logger = logging.getLogger(__name__)

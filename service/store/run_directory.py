@@ -310,7 +310,7 @@ class RunDirectory:
                 self._events.add(metrics)
 
     def record_goals(self, iteration: int, num_env_steps: int, goals: StateArray) -> None:
-        """Append a sample of an iteration's valid proposals: (M, 7) start x y z, goal x y z (metres), solved 0/1."""
+        """Append a sample of an iteration's goals, see ``Iteration``."""
         with self.keep_running(self.goals_file):
             self._goals.append({"iteration": iteration, "env_steps": num_env_steps, "goals": np.round(goals, 4)})
 

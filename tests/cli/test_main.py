@@ -324,6 +324,12 @@ def test_evaluate_in_a_world_of_another_layout_is_refused(trained):
     assert evaluate(trained, "tiny", "--set", "world.randomisation.delay_steps=[1,1]").exit_code == 0
 
 
+def test_evaluate_beside_a_wall_has_the_goals_of_such_a_world(trained):
+    result = evaluate(trained, "tiny", "--set", "world.fixture=wall", "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["idle"]["goals"] == "table"
+
+
 def test_evaluate_for_people(trained):
     result = evaluate(trained, "tiny@1", "--goals", "mixed")
     assert result.exit_code == 0

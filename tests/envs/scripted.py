@@ -72,6 +72,6 @@ def place_in_air(config, num_worlds, *, seed, num_threads=2):
         arrived = distance()
         held = worlds.object_position - worlds.ee_position
         slip = np.zeros(num_worlds)
-        for _ in drive(worlds, carry, CLOSE, round(_HOLD_S / (config.physics_step_s * config.num_substeps))):
+        for _ in drive(worlds, carry, CLOSE, round(_HOLD_S / config.step_s)):
             slip = np.maximum(slip, np.linalg.norm(worlds.object_position - worlds.ee_position - held, axis=1))
         return Placement(grasped, arrived, distance(), slip)

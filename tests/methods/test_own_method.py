@@ -227,6 +227,14 @@ def test_an_error_of_the_method_names_its_line(file, tmp_path, monkeypatch, old,
     assert_one_line(error.value, said)
 
 
+@pytest.mark.usefixtures("default_signals")
+def test_goals_of_several_objects_are_recorded(file, tmp_path):
+    file.write_text(CODE.replace("self.height})", "self.height}, goals=np.full((2, 13), 0.1))"))
+    directory = RunDirectory(tmp_path / "run")
+    train(config_of("world.objects=[cube, cube]"), directory, tmp_path / "registry", on_iteration=ignore)
+    assert read_lines(directory.goals_file)[-1]["goals"] == [[0.1] * 13] * 2
+
+
 @pytest.mark.usefixtures("default_signals", "file")
 def test_what_makes_nothing_to_publish_is_refused_before_it_learns(tmp_path):
     directory = RunDirectory(tmp_path / "run")

@@ -151,7 +151,7 @@ def test_a_finished_run_that_goes_on_publishes_another_version(home):
 @pytest.mark.usefixtures("quick")
 def test_a_bob_without_primitives_is_not_published(tmp_path):
     config = parse_config(TREE | {"policy": TREE["policy"] | {"monolithic_bob": {"hidden_sizes": [8]}}}, where="a test")
-    with pytest.raises(TandemError, match="a Bob without primitives .* cannot be published"):
+    with pytest.raises(TandemError, match=r"a Bob without primitives .* cannot be published"):
         run_pretrain(tmp_path, config, publish=True)
     assert list(tmp_path.iterdir()) == []
 

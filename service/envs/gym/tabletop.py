@@ -279,7 +279,7 @@ class TabletopEnv(GoalWorlds, gymnasium.Env[Any, FloatArray]):
         super().__init__(1, 1, config, task, success_distance_m, registered)
         self.np_random, self.render_mode = self._random[0], render_mode
         self._counts_steps = registered is None
-        step_s = self.config.physics_step_s * self.config.num_substeps
+        step_s = self.config.step_s
         self.metadata = {**self.metadata, "render_fps": round(1.0 / step_s)}
         self.observation_space = goal_space(self.config)
         self.action_space = action_space()

@@ -46,7 +46,7 @@ class Game:
         self._rng = np.random.default_rng(seed)
         self.worlds = WorldBatch(self.world, 1, num_threads=1)
         self._rules = Rules(players.tried_on, self.worlds, players.success_distance_m)
-        self.step_s = self.world.physics_step_s * self.world.num_substeps
+        self.step_s = self.world.step_s
         self.mode: Mode = "goals"
         self.new_goals = True
         """Whether another goal comes when Bob is there, or his time is over."""
