@@ -12,10 +12,10 @@ from service.base.types import FloatArray
 from service.config.task_methods import find_method
 from service.envs.observations import ObservationLayout, layouts
 from service.policies.forward import FUNCTIONS
+from service.policies.learned_policy import RESIDUAL, LearnedPolicy, action_weights, learner_inputs
 from service.policies.numpy_actor import MOVED, STEP_SCALE_M, numpy_actor
 from service.policies.numpy_policy import NumpyMCPPolicy, NumpyPolicy
 from service.policies.parameters import Parameters
-from service.registry.learned import RESIDUAL, LearnedPolicy, action_weights, learner_inputs
 from service.registry.loading import Trained
 
 Outputs = dict[str, FloatArray]

@@ -21,8 +21,8 @@ from service.base.errors import TandemError
 from service.base.types import FloatArray
 from service.config import WorldConfig
 from service.envs.observations import layouts
+from service.policies.learned_policy import compose_actions
 from service.policies.numpy_policy import NumpyMCPPolicy
-from service.registry.learned import compose_actions
 from service.registry.loading import Trained
 
 Info = dict[str, Any]

@@ -39,8 +39,8 @@ from service.methods.method import Iteration, Method, State
 from service.methods.task_check import check_fits, check_task
 from service.methods.task_evaluation import CURVE_SEED, FINAL_SEED, evaluate_on, numbers_of
 from service.methods.task_worlds import SkillTaskWorlds, TaskWorlds, columns
+from service.policies.learned_policy import RESIDUAL, learner_inputs, num_inputs
 from service.policies.parameters import Parameters
-from service.registry.learned import RESIDUAL, learner_inputs, num_inputs
 from service.registry.loading import Trained, learned_policy, load
 
 _RELABELLED_UNTIL = 0.5

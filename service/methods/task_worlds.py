@@ -16,7 +16,7 @@ from service.envs.task import num_in_rows
 from service.learner.off_policy import Step, TabletopWorlds
 from service.learner.replay import Columns
 from service.policies.frozen_skills import FrozenSkills
-from service.registry.learned import learner_inputs
+from service.policies.learned_policy import learner_inputs
 
 _POSITIONS = ("previous", "positions", "following")
 

@@ -30,12 +30,12 @@ from service.envs.observations import layouts
 from service.envs.task import Task
 from service.envs.tasks import find_task
 from service.policies.frozen_skills import FrozenSkills, ZeroShotPolicy
+from service.policies.learned_policy import LearnedPolicy
 from service.policies.numpy_actor import numpy_actor
 from service.policies.numpy_policy import NumpyGaussianPolicy, NumpyMCPPolicy, NumpyPolicy, numpy_bob
 from service.policies.parameters import Parameters, PolicyError
 from service.registry.bundled import BUNDLED, find_version, is_bundled, is_exported
 from service.registry.digest import parameters_digest
-from service.registry.learned import LearnedPolicy
 from service.registry.manifest import Manifest, acting_config
 from service.store.checkpoints import Checkpoint, CheckpointStore, read_checkpoint
 from service.store.run_directory import Published, RunDirectory

@@ -17,10 +17,10 @@ from service.config.task import TaskConfig
 from service.envs.observations import POSITIONS, SPACES, layouts
 from service.envs.tasks import find_task
 from service.policies.frozen_skills import FrozenSkills
+from service.policies.learned_policy import num_inputs
 from service.policies.numpy_policy import numpy_bob
 from service.policies.parameters import Parameters
 from service.registry.bundled import BUNDLED, find_version
-from service.registry.learned import num_inputs
 from service.registry.names import Version, is_service
 from service.registry.registry import Registry, sha256_of
 from service.store.run_directory import Published, RunDirectory

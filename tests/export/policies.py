@@ -8,8 +8,8 @@ from service.config.task import TaskConfig
 from service.config.task_methods import TASK_METHODS
 from service.envs.observations import layouts
 from service.learner.sac_networks import GaussianActor
+from service.policies.learned_policy import num_inputs
 from service.policies.networks import export_parameters, make_bob
-from service.registry.learned import num_inputs
 from service.registry.loading import load
 from service.registry.publishing import publish
 from service.store.checkpoints import CheckpointStore

@@ -11,8 +11,8 @@ from service.export import exporting
 from service.export.exporting import check_parity, make_inputs
 from service.export.formats import find_format
 from service.export.networks import network_of_bob, network_of_orchestrator, network_of_primitive
+from service.policies.learned_policy import LearnedPolicy
 from service.policies.numpy_policy import numpy_bob
-from service.registry.learned import LearnedPolicy
 from service.registry.loading import Trained
 from tests.export.policies import CONFIG, MONOLITHIC, SEEN, TWO_CUBES, actor_of, parameters_of
 

@@ -26,9 +26,9 @@ from service.methods.compose import (
     check_primitives,
 )
 from service.policies.frozen_skills import FrozenSkills
+from service.policies.learned_policy import action_weights
 from service.policies.numpy_policy import NumpyGaussianPolicy
 from service.registry.digest import parameters_digest
-from service.registry.learned import action_weights
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "downstream.md"
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)

@@ -9,7 +9,7 @@ from service.config import WorldConfig
 from service.envs.gym.vector import TabletopVectorEnv
 from service.methods.compose import ComposePrimitivesVector
 from service.methods.task_worlds import TaskWorlds
-from service.registry.learned import learner_inputs
+from service.policies.learned_policy import learner_inputs
 
 CONFIG = WorldConfig(physics_step_s=0.005, num_substeps=8)
 NUM, LENGTH, SEED = 3, 6, 8

@@ -12,8 +12,8 @@ from service.envs.observations import layouts
 from service.envs.task import Task
 from service.envs.tasks import find_task
 from service.learner.sac_networks import GaussianActor
+from service.policies.learned_policy import LearnedPolicy, action_weights, num_inputs
 from service.policies.networks import export_parameters
-from service.registry.learned import LearnedPolicy, action_weights, num_inputs
 from service.registry.loading import Trained
 from service.robot.play.game import Game
 
