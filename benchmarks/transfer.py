@@ -17,8 +17,9 @@ import numpy as np
 
 from benchmarks.measuring import run_benchmark
 from benchmarks.report.markdown import measured_on, percent
-from service.actors.evaluation import evaluate, wilson_interval
+from service.actors.evaluation import evaluate
 from service.base.errors import RobotError
+from service.base.intervals import wilson_interval
 from service.base.markdown import table
 from service.base.types import BoolArray, StateArray
 from service.envs.sampling import draw_first, draw_goals

@@ -109,7 +109,8 @@ def test_loading_the_champion(tmp_path, monkeypatch):
 
 def test_the_champion_has_what_its_manifest_says():
     """Its rate, which pages repeat, on other goals: not lower than chance explains."""
-    from service.actors.evaluation import evaluate, wilson_interval
+    from service.actors.evaluation import evaluate
+    from service.base.intervals import wilson_interval
 
     bob, num = service.load(), 60
     said = bob.manifest.metrics["evaluation/mixed_success_last"]

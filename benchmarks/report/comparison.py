@@ -9,11 +9,10 @@ from benchmarks.report.downstream import BEST, PAPER, Seeds, each_seed, mean_unt
 from benchmarks.report.markdown import Row, from_to, millions, percent
 from benchmarks.report.results import TRIAL, Result, by_method_and_task
 from benchmarks.reproduce import MANY_UPDATES, PAPER_PRIMITIVES, Experiment
-from service.actors.evaluation import wilson_interval
+from service.base.intervals import Rate, rate_of, wilson_interval
 from service.base.markdown import table
 from service.config.task_methods import TASK_METHODS
 from service.envs.tasks import PAPERS, find_task
-from service.methods.task_evaluation import Rate, rate_of
 
 PAPER_EPISODES = 48
 """Of each of the paper's rates, most likely: nearly all are multiples of 1/48, so 16 episodes of three seeds."""

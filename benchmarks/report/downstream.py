@@ -14,12 +14,12 @@ from benchmarks.report.results import TRIAL, Result, by_method_and_task
 from benchmarks.run_files import steps_until
 from service.base.errors import TandemError
 from service.base.files import write_atomic
+from service.base.intervals import rate_of
 from service.base.markdown import table
 from service.base.version import LEARNING_VERSION
 from service.config.task_methods import TASK_METHODS
 from service.envs.tasks import PAPERS, TASKS, find_task
 from service.media.figures import BLUE, FAINT, GREEN, ORANGE, new_figure, save, style_axes
-from service.methods.task_evaluation import rate_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

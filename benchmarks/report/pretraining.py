@@ -12,9 +12,9 @@ from benchmarks.report.markdown import Row, commit, duration, millions, percent
 from benchmarks.run_files import RANDOM, STAGES, Records, Run, binned, mean_share, steps_until, unthin
 from benchmarks.seeds import KINDS, NUM_EPISODES
 from benchmarks.why_alice import ARMS
+from service.base.intervals import rate_of
 from service.base.markdown import table
 from service.config.self_play import SelfPlayConfig
-from service.methods.task_evaluation import rate_of
 from service.registry.bundled import BUNDLED
 from service.registry.digest import parameters_digest
 from service.registry.loading import load

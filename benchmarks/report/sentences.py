@@ -11,10 +11,10 @@ from benchmarks.report.downstream import Seeds, mean_until
 from benchmarks.report.markdown import from_to, millions, percent
 from benchmarks.report.results import Result, by_method_and_task
 from benchmarks.reproduce import MANY_UPDATES
+from service.base.intervals import rate_of
 from service.base.types import FloatArray
 from service.config.task_methods import TASK_METHODS
 from service.envs.tasks import PAPERS, find_task
-from service.methods.task_evaluation import rate_of
 
 LEVEL = 0.05
 """Two means that differ by less are level: single points of a curve scatter by about as much."""

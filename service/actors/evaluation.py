@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from service.base.intervals import wilson_interval
 from service.base.progress import doing
 from service.base.types import BoolArray, FloatArray, Metrics, StateArray
 from service.config import Config, WorldConfig
@@ -164,11 +165,3 @@ def success_metrics(
         metrics[f"evaluation/{kind}_success_last"] = result.success_last
         metrics[f"evaluation/{kind}_success_ever"] = result.success_ever
     return metrics
-
-
-def wilson_interval(successes: int, num: int) -> tuple[float, float]:
-    """95 % Wilson score interval of a proportion (Wilson 1927)."""
-    z, share = 1.96, successes / num
-    centre = (share + z * z / (2 * num)) / (1 + z * z / num)
-    half = z * np.sqrt(share * (1 - share) / num + z * z / (4 * num * num)) / (1 + z * z / num)
-    return float(max(centre - half, 0.0)), float(min(centre + half, 1.0))

@@ -106,7 +106,7 @@ class Rules:
     def _places(self, name: str, rng: np.random.Generator, worlds: slice) -> StateArray:
         """(N, 3 K) places by a function of the task; drawn again where they are out of reach, or inside something."""
         batch = self._worlds
-        config = batch.config
+        config, there = batch.config, batch.places.of(worlds)
         view = self.view(batch.object_position).of(worlds)
         place, wrong = view.goal.reshape(len(view.goal), -1).copy(), np.ones(len(view.goal), dtype=bool)
         for _ in range(_MAX_DRAWS):
@@ -117,7 +117,8 @@ class Rules:
                 "out of reach, or inside the table": self.out_of_reach(place),
                 "inside a fixture": inside_fixtures(place, config),
                 "inside each other": inside_each_other(place, config),
-                "inside an obstacle or the box": self.inside_things(place, worlds, bottom=name == "starts"),
+                "inside an obstacle or the box": inside_obstacles(place, there.obstacles, config)
+                | inside_box(place, there.box, config, bottom=name == "starts"),
             }
             if name == "starts":
                 # It may know heights as they are in its world, or as the configuration has them.
@@ -169,15 +170,6 @@ class Rules:
         reached = self._worlds.reach.clip(raised)
         reached[:, 2] = np.minimum(raised[:, 2], self._worlds.reach.height[-1])
         return reached.reshape(goal.shape)
-
-    def inside_things(self, place: StateArray, worlds: slice = _ALL, *, bottom: bool = False) -> BoolArray:
-        """(N,) whether objects at (N, 3 K), metres, would be inside what is elsewhere in every game.
-
-        That is an obstacle, or a side of a box, or its ``bottom``, too.
-        """
-        batch, there = self._worlds, self._worlds.places.of(worlds)
-        in_box = inside_box(place, there.box, batch.config, bottom=bottom)
-        return in_box | inside_obstacles(place, there.obstacles, batch.config)
 
     def out_of_reach(self, goal: StateArray) -> BoolArray:
         """(N,) whether the arm brings an object not as near to its place of (N, 3 K) goals as counts.

@@ -16,6 +16,7 @@ from typing import Any
 from zlib import crc32
 
 from service.base.errors import TandemError
+from service.base.intervals import rate_of
 from service.base.parsing import parse_json
 from service.base.version import LEARNING_VERSION
 from service.config.task_methods import TASK_METHODS
@@ -147,8 +148,6 @@ def _rows(runs: Sequence[_Run]) -> list[dict[Column, list[_Run]]]:
 
 
 def _cell(runs: Sequence[_Run], values: Mapping[str, set[str]]) -> TaskCell:
-    from service.methods.task_evaluation import rate_of
-
     ended = sorted((run for run in runs if run.result is not None), key=lambda run: run.ended)
     by_seed = {run.trial.seed: run for run in ended}
     counted = [by_seed[seed] for seed in sorted(by_seed)]

@@ -6,7 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from service.actors.evaluation import Evaluation, IdlePolicy, evaluate, evaluated_goals, wilson_interval
+from service.actors.evaluation import Evaluation, IdlePolicy, evaluate, evaluated_goals
+from service.base.intervals import wilson_interval
 from service.base.liveness import work_done
 from service.config import WorldConfig
 from service.envs.sampling import GOAL_KINDS, sample_goals, sample_on_table
@@ -118,24 +119,6 @@ def test_the_idle_floor_is_the_analytic_one():
     assert abs(idle_floor("table") - exact) < 0.0015
     assert abs(idle_floor("mixed") - 0.021) < 0.001
     assert idle_floor("air", 10_000) == 0.0
-
-
-# --- intervals -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("successes", "low", "high"),
-    [(25, 0.38, 0.66), (40, 0.70, 0.91), (45, 0.83, 0.98), (44, 0.80, 0.97), (47, 0.89, 1.0)],
-)
-def test_wilson_interval_of_48_episodes(successes, low, high):
-    # algorithms.md 0.3
-    assert tuple(round(end, 2) for end in wilson_interval(successes, 48)) == (low, high)
-
-
-def test_wilson_interval_at_the_ends():
-    # z^2 / (n + z^2) with n = 10: 3.8416 / 13.8416
-    assert wilson_interval(0, 10) == pytest.approx((0.0, 3.8416 / 13.8416))
-    assert wilson_interval(10, 10) == pytest.approx((10 / 13.8416, 1.0))
 
 
 # --- evaluate --------------------------------------------------------------------------------------------------------

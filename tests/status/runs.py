@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from service.actors.evaluation import wilson_interval
+from service.base.intervals import wilson_interval
 from service.base.version import LEARNING_VERSION
 from service.registry.names import Version
 from service.registry.registry import Registry

@@ -1,6 +1,8 @@
+"""Intervals of success, by hand."""
+
 import pytest
 
-from service.methods.task_evaluation import rate_of, seed_interval
+from service.base.intervals import rate_of, seed_interval, wilson_interval
 
 
 def test_rates_by_hand():
@@ -23,3 +25,18 @@ def test_intervals_by_hand():
     assert seed_interval([0.0, 1.0] * 8) == pytest.approx((0.5 - 2.131 * 0.516398 / 4, 0.5 + 2.131 * 0.516398 / 4))
     half = 1.96 * (36 / 35 / 4) ** 0.5 / 6  # near enough from 31 degrees of freedom on
     assert seed_interval([0.0, 1.0] * 18) == pytest.approx((0.5 - half, 0.5 + half))
+
+
+@pytest.mark.parametrize(
+    ("successes", "low", "high"),
+    [(25, 0.38, 0.66), (40, 0.70, 0.91), (45, 0.83, 0.98), (44, 0.80, 0.97), (47, 0.89, 1.0)],
+)
+def test_wilson_interval_of_48_episodes(successes, low, high):
+    # algorithms.md 0.3
+    assert tuple(round(end, 2) for end in wilson_interval(successes, 48)) == (low, high)
+
+
+def test_wilson_interval_at_the_ends():
+    # z^2 / (n + z^2) with n = 10: 3.8416 / 13.8416
+    assert wilson_interval(0, 10) == pytest.approx((0.0, 3.8416 / 13.8416))
+    assert wilson_interval(10, 10) == pytest.approx((10 / 13.8416, 1.0))
