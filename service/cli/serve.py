@@ -53,7 +53,7 @@ def serve(
         raise StatusError(f"no directory {runs}; name with --runs the one that holds run directories")
     token = read_token(token_file)
     chosen = choose_port(host, port)
-    server = StatusServer(open_reader(runs), Registry(registry), token=token, host=host, port=chosen, runs_dir=runs)
+    server = StatusServer(open_reader(runs), Registry(registry), token=token, host=host, port=chosen)
     typer.echo(f"runs of {runs}, primitives of {registry}: {server.url}")
     if token is None:
         typer.echo(f"read-only, for this machine: with {VARIABLE} set, runs can be stopped and aliases moved")

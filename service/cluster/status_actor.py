@@ -49,9 +49,7 @@ class StatusWorker:
         reader, options = open_reader(self._runs_dir, self._redis), self._options
         registry = Registry(self._registry)
         assert options.port is not None, "chosen"
-        self._server = StatusServer(
-            reader, registry, token=options.token, host=options.host, port=options.port, runs_dir=self._runs_dir
-        )
+        self._server = StatusServer(reader, registry, token=options.token, host=options.host, port=options.port)
         self._server.start()
         return self._server.url
 

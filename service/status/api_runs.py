@@ -15,7 +15,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from service.base.errors import StoreError
 from service.status import run_details, series
-from service.status.files import BYTES, PARTS, RUN_FILES, RunDirectories, file_response, kind_of
+from service.status.files import BYTES, PARTS, RUN_FILES, file_response, find_file, kind_of, run_files
 from service.status.problems import INVALID, READ_ONLY, UNAVAILABLE, UNKNOWN_RUN, ProblemError, problems
 from service.status.schemas import (
     Axis,
@@ -55,7 +55,7 @@ _Bound = Annotated[float | None, Query(ge=-1e15, le=1e15, allow_inf_nan=False)]
 _MaxPoints = Annotated[int, Query(ge=1, le=10_000, description="down-sample to at most this many points")]
 
 
-def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, registry: Path) -> APIRouter:
+def runs_router(runs: RunReader, streams: Streams, registry: Path) -> APIRouter:
     """Make the routes about runs; ``registry`` is the root of the one that commands name."""
     router = APIRouter(tags=["runs"])
     read = problems(INVALID, UNAVAILABLE)
@@ -158,18 +158,18 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
     def get_goal_history(run_id: _Run, frames: Annotated[int, Query(ge=1, le=60)] = 24) -> GoalFrames:
         """From the sample of goals that a run records: cells, and how often Bob reached their goals, part by part."""
         runs.run(run_id)
-        return run_details.goal_frames(directories.directory(run_id), runs.goals(run_id), frames)
+        return run_details.goal_frames(runs.directory(run_id), runs.goals(run_id), frames)
 
     @router.get("/v1/runs/{run_id}/setup", summary="A run's configuration and commands", responses=errors)
     def get_setup(run_id: _Run) -> RunSetup:
         """The resolved configuration, the directory, and the commands that stop the run, resume it or use it."""
-        return run_details.setup(runs.run(run_id), directories.directory(run_id), registry)
+        return run_details.setup(runs.run(run_id), runs.directory(run_id), registry)
 
     @router.get("/v1/runs/{run_id}/log", summary="What happened to a run", responses=errors)
     def get_log(run_id: _Run, limit: Annotated[int, Query(ge=1, le=10_000)] = 500) -> RunLog:
         """Who died, who came back, what went wrong, and what its processes said, oldest first."""
         runs.run(run_id)
-        return run_details.log(directories.directory(run_id), limit)
+        return run_details.log(runs.directory(run_id), limit)
 
     @router.post(
         "/v1/runs/{run_id}/stop",
@@ -186,7 +186,7 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
     def list_files(run_id: _Run) -> RunFiles:
         """The files that exist at the moment."""
         runs.run(run_id)
-        return RunFiles(files=tuple(directories.files(run_id)))
+        return RunFiles(files=tuple(run_files(runs.directory(run_id), run_id)))
 
     @router.get(
         "/v1/runs/{run_id}/files/{file}",
@@ -201,7 +201,7 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
     def get_file(request: Request, run_id: _Run, file: Annotated[str, InPath(max_length=64)]) -> Response:
         """With ranges and an entity tag."""
         runs.run(run_id)
-        path = directories.path(run_id, file)
+        path = find_file(runs.directory(run_id), run_id, file)
         return file_response(request, path, kind_of(file)[1], cache="private, no-cache")
 
     @router.get(
@@ -216,13 +216,13 @@ def runs_router(runs: RunReader, streams: Streams, directories: RunDirectories, 
     )
     def get_video(request: Request, run_id: _Run) -> Response:
         """Alice beside Bob, random skills, or episodes of a downstream task: the first that `files` lists."""
-        names = [file.name for file in directories.files(run_id) if file.media_type == "video/mp4"]
+        names = [file.name for file in run_files(runs.directory(run_id), run_id) if file.media_type == "video/mp4"]
         return get_file(request, run_id, names[0] if names else "rounds.mp4")
 
     @router.get("/v1/downstream", summary="Success of methods on downstream tasks", responses=problems(UNAVAILABLE))
     def get_downstream() -> TaskTable:
         """From the runs that learn a task: each cell is a mean over seeds, with its interval."""
-        return task_table(runs.runs(), directories.directories())
+        return task_table(runs.runs(), runs.directories())
 
     @router.get(
         "/v1/series",

@@ -20,7 +20,7 @@ from service.registry.token import SESSION_COOKIE, VARIABLE, check_authorization
 from service.status.api_primitives import primitives_router
 from service.status.api_runs import runs_router
 from service.status.auth import TRUSTED, AuthMiddleware
-from service.status.files import RunDirectories, file_response
+from service.status.files import file_response
 from service.status.metrics import CONTENT_TYPE, Telemetry
 from service.status.problems import COMMON, INVALID, READ_ONLY, Problem, ProblemError, add_handlers, problems
 from service.status.schemas import ServiceState, TokenEntry
@@ -68,13 +68,11 @@ def create_app(
     *,
     token: str | None,
     public: bool,
-    runs_dir: Path,
 ) -> FastAPI:
     """Make the app with the REST API, ``/metrics`` and the web page.
 
     Requests that change something need the token; if ``public``, so that other machines can reach the service, all do.
-    If not public, only requests for localhost are answered. ``runs_dir`` has the pictures and videos of runs. The
-    server closes ``app.state.streams`` when it stops.
+    If not public, only requests for localhost are answered. The server closes ``app.state.streams`` when it stops.
 
     Raises:
         StatusError: public without a token, or a token that is too short.
@@ -100,7 +98,7 @@ def create_app(
     )
     app.state.streams = streams
     app.include_router(_service_router(runs, registry, telemetry, token))
-    app.include_router(runs_router(runs, streams, RunDirectories(runs_dir), registry.root), dependencies=SECURITY)
+    app.include_router(runs_router(runs, streams, registry.root), dependencies=SECURITY)
     app.include_router(primitives_router(registry), dependencies=SECURITY)
 
     @app.get("/", include_in_schema=False)

@@ -16,7 +16,6 @@ from starlette.staticfiles import NotModifiedResponse, StaticFiles
 from service.base.files import open_regular
 from service.status.problems import ProblemError, problems
 from service.status.schemas import RunFile
-from service.store.disk_reader import run_directories
 from service.store.run_directory import RECORDINGS
 
 RUN_FILES = {
@@ -49,68 +48,47 @@ def kind_of(name: str) -> tuple[str, str]:
     return RUN_FILES[f"{older[1]}.mp4" if older else name]
 
 
-class RunDirectories:
-    """Pictures and videos in the run directories of ``root``."""
-
-    def __init__(self, root: Path) -> None:
-        self._root = root
-        self._found: dict[str, Path] = {}
-        """Of the last listing."""
-
-    def files(self, run_id: str) -> list[RunFile]:
-        """List those of ``RUN_FILES`` and older recordings that exist; empty if the run has no directory."""
-        found = []
-        for name, path in self._paths(run_id).items():
-            title, media_type = kind_of(name)
-            with suppress(OSError):  # it may be deleted meanwhile
-                status = path.stat()
-                found.append(
-                    RunFile(
-                        name=name,
-                        title=title,
-                        media_type=media_type,
-                        num_bytes=status.st_size,
-                        modified=datetime.fromtimestamp(status.st_mtime, UTC),
-                        url=f"/v1/runs/{run_id}/files/{name}",
-                    )
+def run_files(directory: Path | None, run_id: str) -> list[RunFile]:
+    """List those of ``RUN_FILES`` and older recordings that a run's directory has; empty if it has no directory."""
+    found = []
+    for name, path in _paths(directory).items():
+        title, media_type = kind_of(name)
+        with suppress(OSError):  # it may be deleted meanwhile
+            status = path.stat()
+            found.append(
+                RunFile(
+                    name=name,
+                    title=title,
+                    media_type=media_type,
+                    num_bytes=status.st_size,
+                    modified=datetime.fromtimestamp(status.st_mtime, UTC),
+                    url=f"/v1/runs/{run_id}/files/{name}",
                 )
-        return found
+            )
+    return found
 
-    def path(self, run_id: str, name: str) -> Path:
-        """Find one of them.
 
-        Raises:
-            ProblemError: the run has no such file.
-        """
-        paths = self._paths(run_id)
-        if name not in paths:
-            there = ", ".join(paths) or "nothing yet"
-            raise ProblemError(404, "no-such-file", f"run {run_id} has no {name[:64]!r} to show; it has: {there}")
-        return paths[name]
+def find_file(directory: Path | None, run_id: str, name: str) -> Path:
+    """Find one of them.
 
-    def directory(self, run_id: str) -> Path | None:
-        """Find the directory of a run; None if it is not on this machine."""
-        # looked up instead of built from the id, so that no id leads outside the root
-        known = self._found.get(run_id)
-        return known if known is not None and known.is_dir() else self.directories().get(run_id)
+    Raises:
+        ProblemError: the run has no such file.
+    """
+    paths = _paths(directory)
+    if name not in paths:
+        there = ", ".join(paths) or "nothing yet"
+        raise ProblemError(404, "no-such-file", f"run {run_id} has no {name[:64]!r} to show; it has: {there}")
+    return paths[name]
 
-    def directories(self) -> dict[str, Path]:
-        """The directories of runs that are on this machine, by their ids."""
-        try:
-            self._found = run_directories(self._root)
-        except OSError:
-            return {}
-        return self._found
 
-    def _paths(self, run_id: str) -> dict[str, Path]:
-        directory = self.directory(run_id)
-        if directory is None:
-            return {}
-        paths = {name: directory / name for name in RUN_FILES}
-        with suppress(OSError):  # most runs have no older recordings
-            older = sorted((directory / RECORDINGS).iterdir(), reverse=True)
-            paths |= {path.name: path for path in older if OLDER.fullmatch(path.name)}
-        return {name: path for name, path in paths.items() if os.path.isfile(path) and not os.path.islink(path)}
+def _paths(directory: Path | None) -> dict[str, Path]:
+    if directory is None:
+        return {}
+    paths = {name: directory / name for name in RUN_FILES}
+    with suppress(OSError):  # most runs have no older recordings
+        older = sorted((directory / RECORDINGS).iterdir(), reverse=True)
+        paths |= {path.name: path for path in older if OLDER.fullmatch(path.name)}
+    return {name: path for name, path in paths.items() if os.path.isfile(path) and not os.path.islink(path)}
 
 
 def file_response(

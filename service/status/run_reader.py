@@ -125,6 +125,14 @@ class CombinedReader(RunReader):
                 raise
 
     @override
+    def directories(self) -> dict[str, Path]:
+        return self._disk.directories()
+
+    @override
+    def directory(self, run_id: str) -> Path | None:
+        return self._disk.directory(run_id)
+
+    @override
     def ready(self) -> None:
         """Redis is not needed."""
         self._disk.ready()

@@ -8,7 +8,6 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import uvicorn
 
@@ -48,13 +47,12 @@ class StatusServer:
         token: str | None = None,
         host: str = "127.0.0.1",
         port: int = DEFAULT_PORT,
-        runs_dir: Path,
     ) -> None:
         self._socket = _listen(host, port)
         address, self.port = self._socket.getsockname()[:2]
         try:
             # public or not depends on the bound address, not on the name of the host
-            app = create_app(runs, registry, token=token, public=not is_loopback(address), runs_dir=runs_dir)
+            app = create_app(runs, registry, token=token, public=not is_loopback(address))
         except StatusError:
             self._socket.close()
             raise

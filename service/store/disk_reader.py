@@ -244,6 +244,20 @@ class DiskReader(RunReader):
                 f"cannot use the files in {path}: {error.strerror}; check the disk and the permissions"
             ) from error
 
+    @override
+    def directories(self) -> dict[str, Path]:
+        try:
+            return self._list()
+        except StoreUnavailableError:
+            return {}
+
+    @override
+    def directory(self, run_id: str) -> Path | None:
+        try:
+            return self._find(run_id)
+        except (StoreUnavailableError, UnknownRunError):
+            return None
+
     def _find(self, run_id: str) -> Path:
         known = self._found.get(run_id)
         if known is not None and _is_run(known):  # many clients ask for a few runs, again and again

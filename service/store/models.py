@@ -276,6 +276,14 @@ class RunReader(ABC):
     def request_stop(self, run_id: str) -> None:
         """Ask a run to end after its current iteration, saved; nothing happens if it has ended."""
 
+    def directories(self) -> dict[str, Path]:
+        """The directories of the runs that are on this machine, by their ids. Raises nothing."""
+        return {}
+
+    def directory(self, run_id: str) -> Path | None:
+        """The directory of a run; None if it is not on this machine. No id leads elsewhere. Raises nothing."""
+        return self.directories().get(run_id)
+
     @abstractmethod
     def ready(self) -> None:
         """Return if reads work right now."""

@@ -122,7 +122,7 @@ def test_a_study_of_tasks_is_killed_with_its_driver_and_stopped_and_goes_on(head
         wait_for(lambda: process.poll() is not None or (goes_on() and min(steps_saved()) >= 2))
         assert process.poll() is None, process.stdout.read()
 
-    with StatusServer(DiskReader(tmp_path), registry, port=0, runs_dir=tmp_path) as server:
+    with StatusServer(DiskReader(tmp_path), registry, port=0) as server:
         place = ["--runtime", "ray", "--address", address, "--status", "off", "--registry", server.url]
         command = [sys.executable, "-m", "service", "train", "--run-dir", str(path), *place]
         begin = [*command, *TINY_TASK, "push", "--seeds", "0,1", "--primitives", "tiny@latest", "--parallel", "2"]

@@ -360,9 +360,7 @@ def test_a_status_service_without_the_shared_disk_serves_a_run_and_stops_it(tmp_
             assert client.post("/v1/runs/cube/stop").status_code == 202
         time.sleep(0.5)  # a message to Redis says that there is a request
 
-    with StatusServer(
-        open_reader(tmp_path / "empty"), Registry(tmp_path / "registry"), token=TOKEN, port=0, runs_dir=tmp_path
-    ) as server:
+    with StatusServer(open_reader(tmp_path / "empty"), Registry(tmp_path / "registry"), token=TOKEN, port=0) as server:
         done = run(tmp_path, tiny_config(total_env_steps=10**9), on_iteration=look)
         last = httpx.get(f"{server.url}/v1/runs/cube", headers=BEARER, **CLIENT).json()
     assert done.reason == "interrupted"

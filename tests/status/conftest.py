@@ -42,7 +42,7 @@ def write_home(home: Path) -> None:
 def serve(home: Path, *, token: str | None = TOKEN, host: str = "127.0.0.1", port: int = 0) -> StatusServer:
     """Make a service of the runs and the registry in ``home``; it is not started."""
     runs = home / "runs"
-    return StatusServer(DiskReader(runs), Registry(home / "registry"), token=token, host=host, port=port, runs_dir=runs)
+    return StatusServer(DiskReader(runs), Registry(home / "registry"), token=token, host=host, port=port)
 
 
 @pytest.fixture(scope="module")

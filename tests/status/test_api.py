@@ -230,7 +230,7 @@ def test_an_alias_is_moved_to_a_number_only(client, version):
 
 
 def test_the_bundled_registry_is_read_only(tmp_path):
-    with StatusServer(DiskReader(tmp_path), Registry(BUNDLED), token=TOKEN, port=0, runs_dir=tmp_path) as server:
+    with StatusServer(DiskReader(tmp_path), Registry(BUNDLED), token=TOKEN, port=0) as server:
         url = f"{server.url}/v1/primitives/panda-cube/aliases/mine"
         answer = httpx.put(url, json={"version": 2}, headers=BEARER, **CLIENT)
     assert (answer.status_code, answer.json()["type"]) == (409, "urn:tandem:read-only")

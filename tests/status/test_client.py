@@ -246,7 +246,7 @@ def test_a_cache_that_cannot_be_written(server, tmp_path):
 def champions(tmp_path_factory):
     """A service of the bundled registry."""
     runs = tmp_path_factory.mktemp("runs")
-    with StatusServer(DiskReader(runs), Registry(BUNDLED), port=0, runs_dir=runs) as server:
+    with StatusServer(DiskReader(runs), Registry(BUNDLED), port=0) as server:
         yield server
 
 

@@ -10,7 +10,6 @@ import httpx
 import pytest
 
 from service.registry.registry import Registry
-from service.status.files import RunDirectories
 from service.status.task_table import task_table
 from service.store.disk_reader import DiskReader
 from tests.status.conftest import serve
@@ -34,7 +33,8 @@ def ask(root):
 
 
 def table(root):
-    return task_table(DiskReader(root).runs(), RunDirectories(root).directories())
+    reader = DiskReader(root)
+    return task_table(reader.runs(), reader.directories())
 
 
 def shown(found):

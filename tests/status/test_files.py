@@ -8,7 +8,8 @@ import pytest
 
 from service.registry.registry import Registry
 from service.status import files
-from service.status.files import RunDirectories
+from service.status.files import find_file, run_files
+from service.store.disk_reader import DiskReader
 from tests.status.runs import VIDEO
 
 URL = "/v1/runs/old/video"
@@ -74,10 +75,12 @@ def test_pictures_of_a_studys_run(tmp_path):
     run.mkdir(parents=True)
     for path in (run.parent / "study.json", run / "config.yaml", run / "curves.png"):
         path.write_bytes(b"-")
-    (found,) = RunDirectories(tmp_path).files("night-seed-3")
+    directory = DiskReader(tmp_path).directory("night-seed-3")
+    (found,) = run_files(directory, "night-seed-3")
     assert (found.name, found.num_bytes) == ("curves.png", 1)
-    assert RunDirectories(tmp_path).path("night-seed-3", "curves.png") == run / "curves.png"
-    assert RunDirectories(tmp_path).files("seed-3") == []
+    assert find_file(directory, "night-seed-3", "curves.png") == run / "curves.png"
+    assert DiskReader(tmp_path).directory("seed-3") is None
+    assert run_files(None, "seed-3") == []
 
 
 def test_not_changed(client):

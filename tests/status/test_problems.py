@@ -176,7 +176,7 @@ class BrokenReader(DiskReader):
 
 def test_an_unexpected_error_is_only_in_the_log(tmp_path, caplog):
     caplog.set_level(logging.ERROR)
-    with StatusServer(BrokenReader(tmp_path), Registry(tmp_path / "registry"), port=0, runs_dir=tmp_path) as server:
+    with StatusServer(BrokenReader(tmp_path), Registry(tmp_path / "registry"), port=0) as server:
         answer = httpx.get(f"{server.url}/v1/runs", **CLIENT)
     assert_problem(answer, 500, "failed", "unforeseen")
     assert answer.headers["x-content-type-options"] == "nosniff"

@@ -57,7 +57,7 @@ def test_stopping_frees_the_port_and_ends_the_thread(home):
 
 def test_a_port_that_is_taken(home):
     with serve(home) as server, pytest.raises(StatusError) as error:
-        StatusServer(DiskReader(home), Registry(home), port=server.port, runs_dir=home)
+        StatusServer(DiskReader(home), Registry(home), port=server.port)
     assert str(error.value) == (
         f"port {server.port} of 127.0.0.1 is taken; stop what listens there, or choose another with --port"
     )

@@ -124,9 +124,7 @@ def test_a_run_that_is_only_in_redis(tmp_path):
         for iteration in range(1, 6):
             writer.metrics(record(iteration))
         writer.close()
-        with StatusServer(
-            RedisReader(redis.address), Registry(tmp_path / "registry"), port=0, runs_dir=tmp_path
-        ) as server:
+        with StatusServer(RedisReader(redis.address), Registry(tmp_path / "registry"), port=0) as server:
             url = f"{server.url}/v1/runs/far/metrics/stream?after_iteration=3"
             with httpx.stream("GET", url, **CLIENT) as answer:
                 first, second, known, last = events(answer)
