@@ -16,6 +16,7 @@ from service.base.jsonl import read_jsonl
 from service.cli.robot import parse_goal
 from service.config import WorldConfig
 from service.config.self_play import SelfPlayConfig
+from service.media import video
 from service.registry.loading import Trained
 from service.robot.backends import Backend
 from service.robot.loop import Bridge, BridgeConfig
@@ -33,7 +34,7 @@ def nowhere(tmp_path, monkeypatch):
     monkeypatch.delenv("TANDEM_REGISTRY", raising=False)
 
 
-def test_goals_are_played_logged_and_drawn_from_the_log(tmp_path):
+def test_goals_are_played_logged_and_drawn_from_the_log(tmp_path, monkeypatch):
     log = tmp_path / "log.jsonl"
     ran = invoke(
         "run", "--robot", "mujoco", "--goal=-0.1,0.05,0.2", "--episodes", 2, "--steps", 6, "--log", log, "--json", *FAST
@@ -57,6 +58,13 @@ def test_goals_are_played_logged_and_drawn_from_the_log(tmp_path):
         worlds.restore(drawn.states[3])
         np.testing.assert_allclose(worlds.ee_position[1], row["effector_m"], atol=1e-3)
         np.testing.assert_allclose(worlds.object_position[1], row["object_m"])
+    filmed = []
+    monkeypatch.setattr(video, "write_episode_video", lambda *given: filmed.append(given))
+    assert invoke("replay", log, "--out", "film.mp4").exit_code == 0
+    ((episodes, scene, out),) = filmed
+    np.testing.assert_array_equal(episodes.states, drawn.states)
+    assert (scene, out) == (world, Path("film.mp4"))
+    assert_refused(invoke("replay", log, "--out", tmp_path), "Is a directory")
     again = invoke("run", "--robot", "mujoco", "--log", log)
     assert_refused(again, "there is a file already; name another")
 

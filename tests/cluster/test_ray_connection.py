@@ -5,7 +5,7 @@ import ray
 from ray.exceptions import ActorDiedError, RayTaskError
 
 from service.base.errors import DivergedError, TandemError
-from service.cluster.ray_connection import START_ATTEMPTS, connected, explaining_ray_errors
+from service.cluster.ray_connection import START_ATTEMPTS, _explained, connected, explaining_ray_errors
 from service.methods.method import WorkersError
 from tests.runs.runs import assert_one_line
 
@@ -50,6 +50,18 @@ def test_another_cluster_is_asked_once(starts):
     with pytest.raises(WorkersError), connected("auto"):
         pass
     assert tried == [("auto",)]
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ("Version mismatch: The cluster was started with: Ray: 2.59.0", "it runs other versions of Ray or Python"),
+        ("Authentication failed: invalid token", "set RAY_AUTH_TOKEN"),
+        ("nobody is at home", "no Ray cluster answers there"),
+    ],
+)
+def test_why_a_cluster_cannot_be_used_is_said_in_a_line(said, told):
+    assert_one_line(_explained("head:6379", RuntimeError(f"{said}\n  and more")), "--address head:6379", told, said)
 
 
 # --- workers ----------------------------------------------------------------------------------------------------------

@@ -8,12 +8,14 @@ from ray.exceptions import ActorDiedError, RayTaskError
 
 from service.actors.rollout import MAX_POLICY_LAG
 from service.base.user_code import CodeError
-from service.cluster import actor_pool, ray_actors
+from service.cluster import actor_pool, ray_actors, remote_worker
 from service.cluster.actor_pool import RESTART_S, ActorPool
 from service.cluster.iteration import may_begin, may_update
 from service.cluster.ray_actors import GeneratorActor
 from service.cluster.ray_connection import ClusterOptions
+from service.cluster.remote_worker import RemoteWorker
 from service.cluster.self_play import MAX_FAILED_ROUNDS, RaySelfPlay
+from service.cluster.watch import Clock
 from service.generator.generator import TaskGenerator
 from service.methods.method import WorkersError
 from tests.runs.runs import tiny_config
@@ -107,6 +109,65 @@ def test_actors_that_join_a_resumed_run_do_not_count_as_replaced(method):
     pool = ActorPool(method.config, 1, 5, method._clock)
     pool.resize(2)
     assert [(slot.status().incarnation, slot.status().num_replaced) for slot in pool] == [(5, 0), (5, 0)]
+
+
+def test_the_number_of_actors_follows_the_cores_of_the_cluster(method, monkeypatch):
+    def size_with(cores, *alive, **options):
+        monkeypatch.setattr(ray, "cluster_resources", lambda: {"CPU": cores})
+        method._options = ClusterOptions(**options)
+        method._last_resize = -float("inf")
+        for slot in method._pool:
+            slot.watch.location = {"node": "here", "pid": 1} if slot.index in alive else None
+        method._check_workers()
+        return [slot.index for slot in method._pool]
+
+    method._learner = method._generator = SimpleNamespace(end_if_hung=lambda: None)
+    assert size_with(4.0) == [0, 1, 2, 3]
+    assert size_with(4.0, learner_cpus=1.0) == [0, 1, 2]
+    assert size_with(9.0, actor_threads=4) == [0, 1]
+    assert size_with(4.0) == [0, 1, 2, 3]
+    assert size_with(2.0, 1, 2, 3) == [1, 2, 3]  # those that play go on: their node may be lost, or not
+    assert size_with(0.0) == [1]
+    assert size_with(4.0, num_actors=2) == [1, 0]
+
+
+def test_a_worker_is_started_four_times_with_longer_and_longer_pauses(monkeypatch):
+    waits, spawned = [], []
+
+    def dies(worker):
+        raise ActorDiedError
+
+    monkeypatch.setattr(ray, "put", lambda value: value)
+    monkeypatch.setattr(RemoteWorker, "_spawn", lambda worker, number: spawned.append(number))
+    monkeypatch.setattr(RemoteWorker, "_wait_until_ready", dies)
+    monkeypatch.setattr(RemoteWorker, "close", lambda worker: None)
+    monkeypatch.setattr(remote_worker.time, "sleep", waits.append)
+    worker = RemoteWorker("learner", None, None, None, Clock(), lambda: None)
+    worker.watch = SimpleNamespace(incarnation=0)
+    with pytest.raises(WorkersError, match=r"^the learner died 4 times while it started, at last with: ActorDied"):
+        worker.start()
+    assert waits == [0.5, 1.0, 2.0]
+    assert len(spawned) == 4
+
+
+def test_an_actor_counts_its_rounds_for_prometheus(monkeypatch):
+    counted = []
+
+    def recorder(name, description, tag_keys, boundaries=None):
+        def count(value, tags):
+            assert tuple(tags) == tag_keys
+            counted.append((name, value, tags["actor"]))
+
+        return SimpleNamespace(inc=count, observe=count)
+
+    monkeypatch.setattr(ray_actors, "Counter", recorder)
+    monkeypatch.setattr(ray_actors, "Histogram", recorder)
+    ray_actors._round_counters(3)(SimpleNamespace(num_env_steps=640, play_s=1.5))
+    assert counted == [
+        ("tandem_actor_env_steps", 640, "3"),
+        ("tandem_actor_rounds", 1, "3"),
+        ("tandem_actor_round_seconds", 1.5, "3"),
+    ]
 
 
 def test_an_error_in_code_of_a_users_ends_the_run(method, monkeypatch):

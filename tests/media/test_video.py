@@ -73,8 +73,30 @@ def test_without_a_goal_bob_has_no_turn(tmp_path):
     assert len(read_video(path)[0]) == 4 + 20
 
 
-def test_the_caption_tells_what_happened():
+def test_captions_tell_what_happened(tmp_path, monkeypatch):
+    def captions(write, *shown):
+        told = []
+
+        def caption(picture, text, colour, number=""):
+            told.append(text)
+            return drawn(picture, text, colour, number)
+
+        monkeypatch.setattr(video, "_caption", caption)
+        write(*shown, WorldConfig(), tmp_path / "film.mp4", SMALL)
+        return list(dict.fromkeys(told))
+
+    drawn = video._caption
+    begins = ["Bob waits", "Alice proposes a goal"]
+    turn = ["Alice proposed this goal", "Bob's turn", "Bob tries: 0.0 s", "Bob tries: 0.1 s"]
+    assert captions(write_video, [recorded()]) == [*begins, *turn, "Bob: solved after 0.1 s"]
+    assert captions(write_video, [recorded(solved=False)]) == [*begins, *turn, "Bob: not solved in 0.1 s"]
     assert set(NO_GOAL) == set(Verdict) - {Verdict.VALID}
+    for verdict, reason in NO_GOAL.items():
+        played = recorded(num_bob_steps=0, solved=False, verdict=verdict)
+        assert captions(write_video, [played]) == [*begins, f"Alice: no goal, {reason}"]
+    reached = np.array([[False], [False], [True]])
+    episode = RecordedEpisodes(still(2)[:, None], np.array([[0.0, 0.1, 0.2]]), reached)
+    assert captions(write_episode_video, episode) == ["on the way", "at the goal"]
     assert (video._bar(200, "Bob", (0, 0, 0), "") != video._bar(200, "Alice", (0, 0, 0), "")).any()
 
 

@@ -158,6 +158,7 @@ def test_real_processes_killed_at_random_moments(tmp_path):
     process = PROCESSES.Process(target=play, args=(path, tiny_config(total_env_steps=10**9)))
     process.start()
     delays_s = random.uniform(0.0, 0.5), random.uniform(1.0, 4.0)
+    print(f"killed after {delays_s} s")
     try:
         deadline_s = time.monotonic() + 600.0
         while len(list(path.glob("checkpoints/checkpoint-*"))) < 2:
@@ -180,6 +181,6 @@ def test_real_processes_killed_at_random_moments(tmp_path):
     total = saved.meta["env_steps"] + 300
     play(path, resumed_config(RunDirectory(path), [f"run.total_env_steps={total}"]), resume=True)
     play(tmp_path / "whole", tiny_config(total_env_steps=total))
-    print(f"killed after {delays_s} s, resumed from iteration {saved.step}")
+    print(f"resumed from iteration {saved.step}")
     assert newest(path).step > saved.step
     assert_same_run(path, tmp_path / "whole")
