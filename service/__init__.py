@@ -81,7 +81,7 @@ def train(
         settings: ``a.b=c`` overrides.
         method: of a task, or of skill discovery.
         primitives: that the method of a task takes, a reference as ``load`` has it.
-        run_dir: where it keeps everything; default: ``runs/NAME``.
+        run_dir: where it keeps everything; default: NAME in TANDEM_RUNS or ``runs``.
         registry: where it publishes, and finds what it takes; by default TANDEM_REGISTRY or ``registry``.
         resume: go on with the run there.
         publish: publish what was learned; the command does so by itself, but for tasks.
@@ -111,7 +111,8 @@ def train(
     overrides = [*first, *settings]
     begun = file if file is not None or first else recipes()[DEFAULT_RECIPE]
     registry = registry or _registry()
-    path = Path(run_dir) if run_dir is not None else Path("runs") / load_config(begun, overrides).directory_name
+    runs = Path(os.environ.get("TANDEM_RUNS") or "runs")
+    path = Path(run_dir) if run_dir is not None else runs / load_config(begun, overrides).directory_name
     directory = RunDirectory(path)
     if resume:
         _, said = named(target, method, takes, resumed=True)

@@ -9,6 +9,7 @@ import time
 import numpy as np
 import pytest
 
+import service
 from service.base.errors import ConfigError, TandemError
 from service.config import load_config, parse_config
 from service.envs import rules
@@ -146,6 +147,15 @@ def test_a_finished_run_that_goes_on_publishes_another_version(home):
     assert done.num_env_steps >= 600
     registry = Registry(home / "registry")
     assert [registry.manifest(f"tiny@{number}").parent for number in (1, 2)] == [None, "tiny@1"]
+
+
+def test_a_program_finds_runs_and_registry_where_commands_do(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(module, "train", lambda _, directory, registry, **__: asked.append((directory.path, registry)))
+    monkeypatch.setenv("TANDEM_RUNS", str(tmp_path / "runs"))
+    monkeypatch.setenv("TANDEM_REGISTRY", str(tmp_path / "registry"))
+    service.train("panda-cube-lsd")
+    assert asked == [(tmp_path / "runs" / "panda-cube-lsd", str(tmp_path / "registry"))]
 
 
 @pytest.mark.usefixtures("quick")
