@@ -11,6 +11,7 @@ from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
+from service.base.cores import usable_cores
 from service.base.errors import TandemError
 from service.base.version import __version__, git_commit
 from service.cli.common import JsonOption, print_json, print_table
@@ -20,6 +21,8 @@ _EXTRAS = {
     "data": "minari", "pybullet": "pybullet", "franka": "franky",
 }  # fmt: skip
 """Packages by the extras that bring them."""
+_FOR_ROBOTS = ("pybullet", "franka")
+"""Not advised: the first is compiled for long where it has no wheel, the second is for the machine of an arm."""
 _LEAST_GB = 2.0
 """Of memory and of disk; a run of the recipe takes about half."""
 
@@ -29,8 +32,8 @@ def doctor(as_json: JsonOption = False) -> None:
     import torch
 
     threads = os.cpu_count() or 1
-    usable = len(os.sched_getaffinity(0))
     missing = [extra for extra, package in _EXTRAS.items() if importlib.util.find_spec(package) is None]
+    advised = [extra for extra in missing if extra not in _FOR_ROBOTS]
     memory_gb, disk_gb = _free_memory_gb(), shutil.disk_usage(Path.cwd()).free / 1e9
     rows = [
         ("tandem", f"{__version__}, commit {(git_commit() or 'unknown')[:12]}", ""),
@@ -39,9 +42,9 @@ def doctor(as_json: JsonOption = False) -> None:
         *((name, version(name), "") for name in ("mujoco", "gymnasium", "numpy")),
         ("torch", f"{torch.__version__}, {'CUDA' if torch.cuda.is_available() else 'no CUDA'}", ""),
         ("extras", ", ".join(extra for extra in _EXTRAS if extra not in missing) or "none",
-         f"for more: pip install 'tandem-skills[{','.join(missing)}]'" if missing else ""),
+         f"for more: pip install 'tandem-skills[{','.join(advised)}]'" if advised else ""),
         ("system", platform.platform(), "" if platform.system() == "Linux" else "only Linux is tested"),
-        ("cores", f"{usable} of {threads}", ""),
+        ("cores", f"{usable_cores()} of {threads}", ""),
         ("free memory", f"{memory_gb:.1f} GB" if memory_gb < float("inf") else "unknown",
          "a run takes about 1 GB: end other programs" if memory_gb < _LEAST_GB else ""),
         ("free disk here", f"{disk_gb:.1f} GB", "a run takes up to 1 GB" if disk_gb < _LEAST_GB else ""),

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any, Self
 
 import mujoco
 import numpy as np
 from mujoco import rollout
 
+from service.base.cores import usable_cores
 from service.base.errors import ConfigError, DivergedError, TandemError
 from service.base.liveness import count_work
 from service.base.types import BoolArray, FloatArray, IntArray, StateArray
@@ -74,8 +74,7 @@ class WorldBatch:
         log = mujoco.MjLogConfig.get()  # MuJoCo's own log is a file in the working directory
         log.logto_file = log.logto_console = False
         log.set()
-        cores = len(os.sched_getaffinity(0))
-        num_threads = self._num_threads = min(num_threads or cores, num_worlds)
+        num_threads = self._num_threads = min(num_threads or usable_cores(), num_worlds)
         self._pool = rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._closed = False
         self._data = [mujoco.MjData(self.model) for _ in range(max(num_threads, 1))]

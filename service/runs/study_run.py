@@ -15,6 +15,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from service.base.cores import usable_cores
 from service.base.errors import ConfigError, TandemError
 from service.base.files import last_lines, open_to_append, os_errors, write_atomic
 from service.base.lock import is_locked
@@ -170,7 +171,7 @@ def _reason(log_file: Path, code: int) -> str:
 class Place:
     """Where the runs of a study are: on this machine."""
 
-    num_cores: int = field(default_factory=lambda: len(os.sched_getaffinity(0)))
+    num_cores: int = field(default_factory=usable_cores)
     most_cores: int | None = None
     """Cores of its largest machine; None: of its only one."""
     run: Callable[[Job, Asked], StudyRun] = run_process

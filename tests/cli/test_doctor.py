@@ -37,7 +37,7 @@ def test_it_says_what_to_do(monkeypatch):
     monkeypatch.setattr(doctor, "_free_memory_gb", lambda: 0.5)
     monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 1e9}))
     monkeypatch.setattr(doctor.os, "sched_getaffinity", lambda process: {0, 1})
-    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None if name == "ray" else True)
+    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None if name in ("ray", "franky") else True)
     monkeypatch.setattr(doctor.os, "cpu_count", lambda: 64)
     rows = found()
     assert rows["OpenGL"] == ("no", "cannot draw: install an OpenGL")
