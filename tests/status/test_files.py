@@ -7,7 +7,7 @@ import os
 import pytest
 
 from service.registry.registry import Registry
-from service.status import files
+from service.status import app, files
 from service.status.files import find_file, run_files
 from service.store.disk_reader import DiskReader
 from tests.status.runs import VIDEO
@@ -131,3 +131,10 @@ def test_a_blob(client, home):
     assert client.get(url, headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
     part = client.get(url, headers={"Range": "bytes=8-15"})
     assert (part.status_code, part.content) == (206, answer.content[8:16])
+
+
+def test_curves_without_their_library_say_what_to_install(client, monkeypatch):
+    monkeypatch.setattr(app, "find_spec", lambda name: None)
+    answer = client.get("/page/plotly.js")
+    assert (answer.status_code, answer.json()["type"]) == (404, "urn:tandem:no-plotly")
+    assert "pip install 'tandem-skills[serve]'" in answer.json()["detail"]
