@@ -91,6 +91,17 @@ def answers(url):
         return response.read()
 
 
+def listening_at(port):
+    """The id of the process that listens at a port of this machine; None where none does."""
+    rows = [row.split() for row in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    sockets = {f"socket:[{row[9]}]" for row in rows if row[1].endswith(f":{port:04X}") and row[3] == "0A"}
+    for descriptor in Path("/proc").glob("[0-9]*/fd/*"):
+        with suppress(OSError):  # it is closed meanwhile
+            if os.readlink(descriptor) in sockets:
+                return int(descriptor.parts[2])
+    return None
+
+
 def test_a_study_of_tasks_is_killed_with_its_driver_and_stopped_and_goes_on(head, tmp_path):
     """Two seeds, as tasks of Ray that fetch their primitives over HTTP."""
     _, address = head
@@ -197,6 +208,11 @@ def test_a_job_is_stopped_and_continued_and_publishes(head, tmp_path):
     assert (status["state"], status["runtime"]) == ("running", "ray")
     assert {actor["name"] for actor in status["actors"]} == {"rollout-0", "learner", "generator"}
     assert status["policy_lag"] <= 2
+
+    serving = listening_at(port)
+    os.kill(serving, signal.SIGKILL)  # the status service alone: Ray starts it again where it was
+    assert wait_for(lambda: read_status()["iteration"] > status["iteration"])
+    assert listening_at(port) not in (None, serving)
 
     wait_for(lambda: client.stop_job("first"))
     assert wait_for(lambda: end_of("first")) == "STOPPED"
