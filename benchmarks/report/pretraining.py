@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from statistics import fmean
+from statistics import fmean, median
 from typing import Any
 
 from benchmarks.record_run import ASKED, ASKED_RATES, ASKED_STEPS, TASKS
@@ -122,11 +122,15 @@ def _how_many(study: Mapping[str, Any]) -> str:
 
 
 def seeds_words(study: Mapping[str, Any]) -> str:
-    """The same in a sentence for the README."""
+    """The same in a sentence for the README, and how long the longest runs took."""
     asked = percent(ASKED_RATES["mixed"])
+    most = max(row["asked"] for run in study["runs"] for row in run["measured"])
+    longest = [run for run in study["runs"] if run["measured"][-1]["asked"] == most]
+    took = duration(median(run["curve"][-1]["wall_s"] for run in longest))
     return (
         f"Runs that solve {asked} of random goals or more (no setting was tuned on their seeds):\n"
-        f"{_how_many(study)} env steps ([each seed](docs/results/pretraining.md#every-seed))."
+        f"{_how_many(study)} env steps ([each seed](docs/results/pretraining.md#every-seed)). "
+        f"{millions(most)} took {took} beside another run."
     )
 
 

@@ -70,7 +70,7 @@ def test_the_table_of_seeds_by_hand():
 
     kinds = ("mixed", "table", "air", "larger")
     lifted = (0.9, 0.1, 0.3, 0.0, 0.2, 0.4)  # of the last five the mean is 0.2
-    curve = [{"env_steps": 1e6, "mixed": 0.9, "lifted": share} for share in lifted]
+    curve = [{"env_steps": 1e6, "mixed": 0.9, "lifted": share, "wall_s": 2160.0} for share in lifted]
     runs = [
         {"seed": 1, "measured": [row(2e6, 0.95), row(5e6, 0.978)], "curve": curve},
         {"seed": 2, "measured": [row(2e6, 0.949)], "curve": curve[:1]},
@@ -95,6 +95,7 @@ def test_the_table_of_seeds_by_hand():
     words = seeds_words({"runs": runs})
     assert words.startswith("Runs that solve 95 % of random goals or more (")
     assert "):\n1 of 2 at 2 M, 1 of 1 at 5 M env steps (" in words
+    assert words.endswith(" 5 M took 36 min beside another run.")
     for run, day in zip(runs, (27, 28), strict=True):
         run |= {"git_commit": "fb14796" + 33 * "0", "machine": {"time": f"2026-11-{day}T08:00:00"}}
     first, _, head, *_ = other_seeds("panda-cube-paper", {"runs": runs}).splitlines()
