@@ -125,6 +125,7 @@ def measure_run(directory: RunDirectory) -> dict[str, Any]:
 
 def record_skills(run: RunDirectory | Trained, name: str) -> Run:
     """Everything that is kept of a run of skills, or of self-play as skills; of a published version its end."""
+    learned: dict[str, Any] = {}
     if isinstance(run, RunDirectory):
         config, stages = run.read_config(), read_stages(run)
         series = thin(read_records(run.metrics_file), SKILL_POINTS, KEPT_OF_SKILLS)
@@ -133,14 +134,20 @@ def record_skills(run: RunDirectory | Trained, name: str) -> Run:
     else:
         env_steps = int(run.manifest.metrics["env_steps"])
         config, stages, series = run.config, {env_steps: run.parameters}, {"env_steps": [env_steps]}
+        # what acts has the defaults of all other keys
+        learned = {"config": dict(run.manifest.config), "primitives": run.label, "primitives_digest": run.digest}
     coverage = measure_coverage(stages, config, num_steps=EPISODE_STEPS)
     if coverage is None:
         raise TandemError(f"{name} has a monolithic Bob, who has no skills; name another run")
-    return head_of(config, name) | {
-        "method": config.skills.method if isinstance(config, SkillDiscoveryConfig) else OURS,
-        "series": series,
-        "coverage": coverage,
-    }
+    return (
+        head_of(config, name)
+        | learned
+        | {
+            "method": config.skills.method if isinstance(config, SkillDiscoveryConfig) else OURS,
+            "series": series,
+            "coverage": coverage,
+        }
+    )
 
 
 def count_goals(records: Records, rest_height_m: float) -> dict[str, Any]:

@@ -195,7 +195,8 @@ def _without_hindsight(rates: Mapping[tuple[str, str], Rate]) -> str:
     gaps = {task: abs(rates[OWN, task].mean - rates[OWN_ALONE, task].mean) for task in PAPERS}
     most, *others = sorted(PAPERS, key=lambda task: -gaps[task])
     there, points = percent(rates[OWN_ALONE, most].mean), f"{100 * gaps[others[0]]:.1f}"
-    return f" Composing without hindsight: {there} on *{find_task(most).title}*, else within {points} points."
+    where = find_task(most).title
+    return f" Composing without hindsight: {there} on *{where}*; on others it differs by {points} points at most."
 
 
 def _best(rates: Sequence[Rate]) -> str:

@@ -126,11 +126,12 @@ def seeds_words(study: Mapping[str, Any]) -> str:
     asked = percent(ASKED_RATES["mixed"])
     most = max(row["asked"] for run in study["runs"] for row in run["measured"])
     longest = [run for run in study["runs"] if run["measured"][-1]["asked"] == most]
-    took = duration(median(run["curve"][-1]["wall_s"] for run in longest))
+    minutes = [run["curve"][-1]["wall_s"] / 60 for run in longest]
+    took = f"{min(minutes):.0f} to {max(minutes):.0f} minutes, {median(minutes):.0f} at the median"
     return (
         f"Runs that solve {asked} of random goals or more (no setting was tuned on their seeds):\n"
         f"{_how_many(study)} env steps ([each seed](docs/results/pretraining.md#every-seed)). "
-        f"{millions(most)} took {took} beside another run."
+        f"{millions(most)}: {took}."
     )
 
 

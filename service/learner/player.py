@@ -50,7 +50,7 @@ class Player:
         put_back(state, self.tensors())
         now = self.config.learning_rate
         rate = float(state["learning_rate"])
-        if (before := float(state["configured_rate"])) != now:
+        if (before := float(state.get("configured_rate", now))) != now:  # checkpoints of before do not say
             rate *= now / before
         low, high = (now * bound for bound in LEARNING_RATE_BOUNDS)
         self.optimizer.learning_rate = min(max(rate, low), high)

@@ -100,7 +100,8 @@ class ReplayBuffer:
         """Continue from a buffer of as many worlds, with what fits of its newest steps."""
         self.num_added, self._began = int(state["num_added"]), np.array(state["began"], dtype=np.int64)
         num_saved = len(state[_LAST_STEP])
-        self._first = max(int(state["first"]), self.num_added - min(num_saved, self.num_steps))
+        # states of before 28 November have no "first"
+        self._first = max(int(state.get("first", 0)), self.num_added - min(num_saved, self.num_steps))
         newest = np.arange(self.num_added - min(num_saved, self.num_steps), self.num_added)
         for name, values in {**self._columns, _LAST_STEP: self._last_step}.items():
             values[newest % self.num_steps] = state[name][newest % max(num_saved, 1)]

@@ -263,7 +263,7 @@ class Run:
             return
         self._expect(isinstance(goals, np.ndarray), "the Iteration's goals", goals, "an array, or None")
         columns = 6 * self.config.world.num_objects + 1
-        if goals.ndim != 2 or goals.shape[1] not in (7, columns) or goals.dtype.kind not in "fiu":
+        if goals.ndim != 2 or goals.shape[1] != columns or goals.dtype.kind not in "fiu":
             raise CodeError(
                 f"{self._origin}: the goals of an Iteration are {goals.dtype} of shape {goals.shape}; give numbers of "
                 f"shape (M, {columns}), or None"

@@ -7,7 +7,7 @@
 | ``run.json`` | the run's identity, and of each start what had changed and which records were damaged |
 | ``epochs/`` | a file for each process that ever ran it; the highest number is who runs it now |
 | ``metrics.jsonl`` | an object per iteration, keyed by metric; only ``time/...`` differs between equal runs |
-| ``goals.jsonl`` | per iteration a sample of valid proposals: start x y z, goal x y z (metres), solved 0/1 |
+| ``goals.jsonl`` | per iteration a sample of goals: starts, goals (x y z of each object, metres), solved 0/1 |
 | ``tensorboard/`` | the same metrics as TensorBoard events over env steps |
 | ``checkpoints/`` | the newest checkpoints; ``--resume`` continues from them exactly |
 | ``snapshots/`` | Bob's parameters untrained and after each tenth of the run, kept for good |

@@ -95,7 +95,7 @@ def test_the_table_of_seeds_by_hand():
     words = seeds_words({"runs": runs})
     assert words.startswith("Runs that solve 95 % of random goals or more (")
     assert "):\n1 of 2 at 2 M, 1 of 1 at 5 M env steps (" in words
-    assert words.endswith(" 5 M took 36 min beside another run.")
+    assert words.endswith(" 5 M: 36 to 36 minutes, 36 at the median.")
     for run, day in zip(runs, (27, 28), strict=True):
         run |= {"git_commit": "fb14796" + 33 * "0", "machine": {"time": f"2026-11-{day}T08:00:00"}}
     first, _, head, *_ = other_seeds("panda-cube-paper", {"runs": runs}).splitlines()

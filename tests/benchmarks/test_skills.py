@@ -65,6 +65,8 @@ def test_self_play_is_recorded_as_skills(tmp_path):
 def test_a_published_version_is_recorded_by_its_end():
     champion = load("panda-cube@champion")
     run = record_run.record_skills(champion, "ours-0")
+    assert run["config"]["generator"]["goal_source"] == "reached" != champion.config.generator.goal_source
+    assert run["primitives_digest"] == champion.digest
     assert run["series"] == {"env_steps": [champion.manifest.metrics["env_steps"]]}
     assert run["coverage"]["stages"].keys() == {run_files.RANDOM, "end"}
     row = coverage_table([run]).splitlines()[-1]

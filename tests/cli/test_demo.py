@@ -50,6 +50,7 @@ def told(port, monkeypatch):
     monkeypatch.setattr(demo.importlib.util, "find_spec", lambda name: True)
     monkeypatch.setattr(demo, "free_port", lambda host, first: port)
     monkeypatch.setattr(demo, "answer", said.append)
+    monkeypatch.setattr(demo.webbrowser, "open_new_tab", lambda url: None)
     return said
 
 
@@ -91,6 +92,7 @@ def test_the_live_world_follows_a_run_that_goes_on(told, port, goes_on, monkeypa
     """By the very words with which the demo begins it."""
     with demo._watched(tmp_path / "demo-1", wanted=True) as look:
         look()
+    monkeypatch.undo()
     words = STARTED[0].command
     made = []
 

@@ -205,6 +205,9 @@ def test_half_of_the_learning_rate_is_half_of_the_one_that_was_adapted(adapted, 
     lower.load_state(learner.state())
     assert lower._bob.optimizer.learning_rate == pytest.approx(expected)
     assert lower._alice.optimizer.learning_rate == learner._alice.optimizer.learning_rate
+    before = {name: each for name, each in learner.state().items() if not name.endswith("configured_rate")}
+    lower.load_state(before)  # of before this was saved
+    assert lower._bob.optimizer.learning_rate == pytest.approx(min(adapted, 3e-4))
 
 
 def test_a_state_is_a_copy():
