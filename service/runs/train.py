@@ -342,7 +342,7 @@ def publish_learned(
 
 
 def _measure(config: Config, learned: Trained) -> Metrics:
-    """What the method of the run measures at its end."""
+    """Success of what was learned, on the goals of the end of a run; not what a method of a user's measures itself."""
     if isinstance(config, SkillDiscoveryConfig):
         return measure_skills(config, learned.parameters)
     if isinstance(config, TaskConfig):
