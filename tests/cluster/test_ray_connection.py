@@ -56,7 +56,8 @@ def test_another_cluster_is_asked_once(starts):
     ("said", "told"),
     [
         ("Version mismatch: The cluster was started with: Ray: 2.59.0", "it runs other versions of Ray or Python"),
-        ("Authentication failed: invalid token", "set RAY_AUTH_TOKEN"),
+        ("Authentication failed", "set RAY_AUTH_TOKEN"),
+        ("Invalid token", "set RAY_AUTH_TOKEN"),
         ("nobody is at home", "no Ray cluster answers there"),
     ],
 )
