@@ -93,7 +93,6 @@ class WorldBatch:
         """Share of later starts with a blocked gripper; more than 0 only where it was when the batch was made."""
         self._control_spec = _CONTROL_AND_BOX if self.model.nmocap else int(mujoco.mjtState.mjSTATE_CTRL)
         self.reach.check(config.workspace, robot.name, self.robot.arm)
-        self._widest_m = self.robot.widest_m
         self._fresh_state = self._make_fresh_state()
         self.states: StateArray = np.tile(self._fresh_state, (num_worlds, 1))
         """(N, S)."""
@@ -303,7 +302,7 @@ class WorldBatch:
         control = np.zeros((start.shape[0], self.model.nu + box_place.shape[1]))
         solution = self.robot.arm.solve(joints, target, at=here)
         control[:, :num_joints] = np.clip(solution, joints - MAX_TURN_RAD, joints + MAX_TURN_RAD)
-        widest_m = self._widest_m * ~(start[:, self.layout["gripper_blocked"]] > 0.0).any(axis=1)
+        widest_m = self.robot.widest_m * ~(start[:, self.layout["gripper_blocked"]] > 0.0).any(axis=1)
         fingers = self.robot.finger_values(np.clip(width, 0.0, widest_m))
         control[:, num_joints : num_joints + self.robot.num_fingers] = fingers
         control[:, self.model.nu :] = box_place
@@ -395,7 +394,7 @@ class WorldBatch:
         mujoco.mj_getState(self.model, mujoco.MjData(self.model), state[self.layout.physics], _PHYSICS)
         arm = self.robot.arm
         state[self.layout["joints"]] = arm.solve(arm.home[None], home, num_iterations=30)[0]
-        state[self.layout["fingers"]] = self.robot.finger_values(np.array([self._widest_m]))[0]
+        state[self.layout["fingers"]] = self.robot.finger_values(np.array([self.robot.widest_m]))[0]
         self._check_start(state)
         # Where there is no room, it is said now.
         places = draw_starts(np.random.default_rng(0), _NUM_TRIED_STARTS, self.bank.largest, self.gripper_at_start)

@@ -120,9 +120,9 @@ def check_makes(config: Config) -> None:
         TandemError: it makes nothing, or a Bob without primitives.
     """
     if config.makes is None:
-        raise TandemError(f"a run of the method {config.method} makes nothing that can be published; leave out publish")
+        raise TandemError(f"a run of the method {config.method} makes nothing that can be published")
     if not config.publishable:
-        raise TandemError("a Bob without primitives (policy.monolithic_bob) cannot be published; leave out publish")
+        raise TandemError("a Bob without primitives (policy.monolithic_bob) cannot be published")
 
 
 def check_publishable(config: Config, registry: Path | str) -> None:

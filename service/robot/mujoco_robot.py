@@ -64,7 +64,6 @@ class MujocoRobot:
             self._start = batch.states[0].copy()
         self._fingers = slice(self._robot.num_joints, self._robot.num_joints + self._robot.num_fingers)
         """Their joints and their actuators."""
-        self._widest_m = self._robot.widest_m
         self._fit(given)
         self._data = mujoco.MjData(self.model)
         self._stopped = False
@@ -105,7 +104,7 @@ class MujocoRobot:
         target = self._reach.clip(np.array(command.effector_m, dtype=np.float64)[None])
         solution = self._led(self._robot.arm.solve(joints, target))
         self._data.ctrl[: self._robot.num_joints] = np.clip(solution, joints - MAX_TURN_RAD, joints + MAX_TURN_RAD)[0]
-        width_m = np.clip([command.width_m], 0.0, self._widest_m)
+        width_m = np.clip([command.width_m], 0.0, self._robot.widest_m)
         self._data.ctrl[self._fingers] = self._robot.finger_values(width_m)[0]
         most = np.where(self._robot.turning, np.inf, command.grip_force_n)[:, None]  # a torque is no force
         self.model.actuator_forcerange[self._fingers] = np.clip(self._grip, -most, most)
